@@ -4,9 +4,11 @@ PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3,$(
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 LAYOUT := build/layout/concent_warp
+LEROBOT ?= build/lerobot
+LEROBOT_PYTHON ?= python3.12
 BROWSERS := chromium chromium-browser google-chrome
 
-.PHONY: help demo setup test check lint types imports tests docs format hooks layout system clean
+.PHONY: help demo setup test check lint types imports tests lerobot docs format hooks layout system clean
 .DEFAULT_GOAL := help
 
 help:
@@ -18,6 +20,7 @@ help:
 	@echo "make types    check types"
 	@echo "make imports  check who imports whom"
 	@echo "make tests    run the tests, which also build the documentation site and run notebook and examples"
+	@echo "make lerobot  test the plug-ins for lerobot, in an environment of their own, in build/lerobot"
 	@echo "make docs     build the documentation site, in build/site"
 	@echo "make format   format the code"
 	@echo "make hooks    check each commit before it is made"
@@ -52,6 +55,13 @@ imports: .venv/installed-dev layout
 
 tests: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+# lerobot wants another Python and another torch than the rest.
+lerobot:
+	test -x $(LEROBOT)/bin/python || $(LEROBOT_PYTHON) -m venv $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip --disable-pip-version-check -qq install "lerobot[dataset,evaluation]~=0.6.1" pytest pytest-timeout \
+		--editable . $(foreach name,env policy,--editable plugins/lerobot_$(name)_concent)
+	HF_HUB_OFFLINE=1 $(LEROBOT)/bin/python -m pytest tests/plugins
 
 docs: .venv/installed-dev layout
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir build/site

@@ -27,6 +27,7 @@ _HOMES = {
     "deploy.explain.result": ("Explanation", "TrialExplanation"),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
+    "deploy.trial_environment": ("TrialEnvironment", "TrialObservation", "TrialStep"),
     "diagnosis.cfg": ("DiagnoseCfg",),
     "diagnosis.diagnose": ("diagnose",),
     "diagnosis.forces.locate": ("locate_forces",),
@@ -120,6 +121,7 @@ if TYPE_CHECKING:
     from concent_warp.deploy.explain.result import Explanation, TrialExplanation
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
+    from concent_warp.deploy.trial_environment import TrialEnvironment, TrialObservation, TrialStep
     from concent_warp.diagnosis.cfg import DiagnoseCfg
     from concent_warp.diagnosis.diagnose import diagnose
     from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -83,12 +83,23 @@ class DatasetFilming:
         if self._watched is not None and self._watched in self._open:
             self.album.add(layers, self._watched)
 
-    def add(self, world: int, state: np.ndarray, action: np.ndarray, *, recorded: bool = True) -> None:
-        """Add the frame of a world, with state and action; unless `recorded`, to its video alone."""
+    def add(
+        self,
+        world: int,
+        state: np.ndarray,
+        action: np.ndarray,
+        *,
+        recorded: bool = True,
+        more: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Add the frame of a world, with state, action and the other features that the layout names.
+
+        Unless `recorded`, it goes to the video of the world alone.
+        """
         _, episode, film = self._open[world]
         images = dict(zip(self.camera.cameras, self._images[world], strict=True))
         if recorded:
-            episode.add(images, state, action)
+            episode.add(images, state, action, more=more)
         if film is not None:
             film.add(np.concatenate(list(images.values()), axis=1))
 

@@ -112,7 +112,7 @@ WRONG = {
     "render": (
         "--format mp4", "--keep none", "--splats block=gone.ply", "--splats block", "--codec h999", "--size 0",
         "--networks gone", "--cameras nobody", "--pretrained", "--rate 0", "--lights.elevation 80 35",
-        "--handover gone", "--handover.time 2 1",
+        "--handover gone", "--handover.time 2 1", "--handover.chunk 0",
     ),
     "train-flow": (
         "--cameras nobody", "--backbone magic", "--backbone florence2", "--backbone florence2 --weights gone",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from concent_warp.checks import Bounds, Count, PositiveShare, Signed, Worlds, check_seed, check_settings
-from concent_warp.errors import TrainError
+from concent_warp.errors import RenderError, TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.reality.sensors.live_cameras import LiveCamerasCfg
 from concent_warp.reality.variation import VariationCfg
@@ -111,9 +112,12 @@ class HandoverCfg:
 
     time: Annotated[tuple[float, float], Bounds(0, 3600, ascending=True)] = (0.0, 1.5)
     """Least and largest time for which the first policy drives [s], uniform; episodes last as much longer."""
-    frames: Literal["teacher", "all"] = "teacher"
-    """Frames that go into the data set: those from the hand-over on, or all. What the first policy did is no example
-    to follow."""
+    frames: Literal["teacher", "all", "labelled"] = "teacher"
+    """Frames that go into the data set: those from the hand-over on; all, though what the first policy did is no
+    example to follow; or all, those of the first policy with what the other one would do from there on."""
+    chunk: Annotated[int, Bounds(1, 1000)] = 16
+    """Commands of such a label, found by branching the worlds; a flow policy learns as many of them as its chunks
+    have."""
 
 
 @dataclass(frozen=True)
@@ -184,3 +188,18 @@ def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: in
         raise TrainError("videos are of Reality", fix="add --world reality")
     if record and world != "reality":
         raise TrainError("trials are recorded in Reality", fix="add --world reality")
+
+
+def splat_files(texts: Sequence[str]) -> dict[str, Path]:
+    """Return the files of Gaussian splats by body, each given as body=file.ply.
+
+    Raises:
+        RenderError: One is given otherwise.
+    """
+    found = {}
+    for text in texts:
+        body, _, file = text.partition("=")
+        if not file:
+            raise RenderError("splats are given as body=file.ply", found=repr(text))
+        found[body] = Path(file)
+    return found

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+from concent_warp.deploy.cfg import splat_files
 from concent_warp.deploy.simulated_images import simulated_images
 from concent_warp.run_folder import RunFolder, plain, run_folder, write_settings
 from concent_warp.train.distil.cfg import DistilCfg
@@ -57,6 +58,7 @@ def distil(
         1
     """
     cfg, process = cfg or DistilCfg(), DistributedProcess.from_environment()
+    splat_files(cfg.images.splats)  # before worlds are made
     folder = None if out is None else Path(out)
     inputs = Distillation(policy, cfg, lambda environment: simulated_images(environment, cfg.images, cfg.looks))
     with process.group(process.device(device)), ExitStack() as stack:

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from concent_warp.deploy.cfg import HandoverCfg
 from concent_warp.render.filming import DatasetFilming
 from concent_warp.train.environment.environment import Environment
+from concent_warp.train.trials.branches import branched_commands
 from concent_warp.train.trials.episodes import PolicyFunction
 
 STREAM = 7
@@ -37,6 +38,7 @@ class Handover:
             seed: Seed of the times.
         """
         self._environment, self._driver, self._teacher, self._cfg = environment, driver, teacher, cfg
+        self._labels: np.ndarray | None = None
         self._seed = seed
         self._step = np.zeros(environment.num_envs, dtype=int)
         self._driving = np.zeros(environment.num_envs, dtype=bool)
@@ -50,6 +52,9 @@ class Handover:
     def act(self, observation: TensorDict) -> torch.Tensor:
         """Return actions, shape (N, A): the driver's where it still drives."""
         self._driving = self._environment.episode_length_buf.cpu().numpy() < self._step
+        self._labels = None
+        if self._cfg.frames == "labelled" and self._driving.any():
+            self._labels = branched_commands(self._environment, self._teacher, self._cfg.chunk).cpu().numpy()
         action = self._teacher(observation)
         if not self._driving.any():
             return action
@@ -58,7 +63,14 @@ class Handover:
 
     def is_recorded(self, world: int) -> bool:
         """Return whether the present frame of a world is for the data set: those of the teacher, or all."""
-        return self._cfg.frames == "all" or not self._driving[world]
+        return self._cfg.frames != "teacher" or not self._driving[world]
+
+    def label(self, world: int) -> np.ndarray | None:
+        """Return what the teacher would command from the present frame of a world on, shape (C, nu).
+
+        None where it drives itself, and where no labels are asked for.
+        """
+        return self._labels[world] if self._labels is not None and self._driving[world] else None
 
     def has_taken_over(self, world: int) -> bool:
         """Return whether the teacher drives in a world."""

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.checks import check_device, check_settings
-from concent_warp.deploy.cfg import Format, RenderCfg
+from concent_warp.deploy.cfg import Format, RenderCfg, splat_files
 from concent_warp.errors import RenderError
 from concent_warp.run_folder import (
     SETTINGS,
@@ -110,6 +110,9 @@ def render(
     if cfg.figure is not None:
         claim_file(cfg.figure, overwrite=overwrite or resume)
     _check_replaced(out, overwrite=overwrite)
+    if driver is not None and cfg.handover.frames == "labelled" and format != "lerobot":
+        fix = "render a LeRobot data set, or other --handover.frames"
+        raise RenderError("this format has no place for labels", expected="lerobot", found=format, fix=fix)
     with run_folder(out, overwrite=overwrite, resume=resume, keep_folders=False) as claimed:
         to = Destination(claimed.path, cfg, format, device, resume, driver)
         from concent_warp.recording.recording import Recording
@@ -156,6 +159,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     import torch
 
     from concent_warp.train.environment.worlds import make_environment
+    from concent_warp.train.flow.dataset import LABELS, label_names
     from concent_warp.train.trials.episodes import SUCCESS, Episodes
 
     cfg, run = to.cfg, policy.run
@@ -173,11 +177,15 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
         raise RenderError("a video needs a whole number of frames per second", found=1 / environment.control_step)
     camera, model = _hybrid_camera(cfg, task.model, worlds, to.device)
     joints, layout = _addressed(model, camera, rate)
+    labelled = to.driver is not None and cfg.handover.frames == "labelled"
+    if labelled:
+        layout = replace(layout, more=((LABELS, label_names(layout.action, cfg.handover.chunk)),))
     writer = _dataset_writer(to, layout, model)
     filming = _new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
     handover = None if to.driver is None else _handover(environment, policy, act, filming, to)
     act = act if handover is None else handover.act
     left = [row for row in range(cfg.episodes) if not writer.has(row)]
+    unknown = np.full(len(layout.action) * cfg.handover.chunk, np.nan, dtype=np.float32)
     physics, length = environment.physics, int(environment.max_episode_length)
     with _leaving(filming):
         for first in range(0, len(left), worlds):
@@ -191,10 +199,13 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
             for step in episodes:
                 for world in filming.running:
                     recorded = handover is None or handover.is_recorded(world)
-                    filming.add(world, state[world], step.command[world], recorded=recorded)
+                    label = None if handover is None else handover.label(world)
+                    command = step.command[world] if label is None else label[0]
+                    more = {LABELS: unknown if label is None else label.ravel()} if labelled else None
+                    filming.add(world, state[world], command, recorded=recorded, more=more)
                     if world in step.outcome:
                         success = step.outcome[world] == SUCCESS
-                        shown = handover is None or handover.has_taken_over(world)
+                        shown = labelled or handover is None or handover.has_taken_over(world)
                         filming.end(world, keep=shown and (cfg.keep == "all" or success), success=success)
                 progress((first + len(rows) * episodes.length / length) / len(left))
                 if not filming.running:
@@ -294,12 +305,7 @@ def _hybrid_camera(
     spec = Model(with_cameras(scene, others), given.geometry).spec()
     place_cameras(spec, own)
     model = spec.compile()
-    splats = {}
-    for text in cfg.splats:
-        body, _, file = text.partition("=")
-        if not file:
-            raise RenderError("splats are given as body=file.ply", found=repr(text))
-        splats[body] = Splats.read(Path(file), device=where)
+    splats = {body: Splats.read(file, device=where) for body, file in splat_files(cfg.splats).items()}
     camera = HybridCamera(
         model, names, (cfg.size, cfg.size), worlds, objects=scene.objects(), splats=splats,
         painter=painter, shadows=cfg.lights if cfg.shadows else None, show=cfg.show, device=device, seed=cfg.seed,

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.deploy.cfg import splat_files
 from concent_warp.errors import RenderError
 from concent_warp.kernels.patterns import WAVES, paint_patterns
 from concent_warp.model import Model
@@ -222,12 +223,7 @@ class HybridImages:
         scene = with_cameras(task.model.scene, [name for name in self.cameras if name not in named])
         spec = Model(scene, task.model.geometry).spec()
         place_cameras(spec, own)
-        splats = {}
-        for text in images.splats:
-            body, _, file = text.partition("=")
-            if not file:
-                raise RenderError("splats are given as body=file.ply", found=repr(text))
-            splats[body] = Splats.read(Path(file), device=device)
+        splats = {body: Splats.read(file, device=device) for body, file in splat_files(images.splats).items()}
         self._camera = HybridCamera(
             spec.compile(), self.cameras, (edge, edge), worlds, objects=task.model.scene.objects(), splats=splats,
             painter=painter, shadows=ShadowCfg() if images.shadows else None, device=_warp_name(device),

@@ -81,8 +81,15 @@ class EpisodeLayout:
 class EpisodeWriter(Protocol):
     """An episode that grows frame by frame; images go to disk as they come."""
 
-    def add(self, images: Mapping[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """Add a frame: images (H, W, 3) uint8, state and action."""
+    def add(
+        self,
+        images: Mapping[str, np.ndarray],
+        state: np.ndarray,
+        action: np.ndarray,
+        *,
+        more: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Add a frame: images (H, W, 3) uint8, state and action, and the other features that the layout names."""
         ...
 
     def save(self, *, success: bool = True) -> None:

@@ -109,8 +109,16 @@ class RobomimicEpisode:
         self._state: list[np.ndarray] = []
         self._action: list[np.ndarray] = []
 
-    def add(self, images: Mapping[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """See `EpisodeWriter.add`."""
+    def add(
+        self,
+        images: Mapping[str, np.ndarray],
+        state: np.ndarray,
+        action: np.ndarray,
+        *,
+        more: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """See `EpisodeWriter.add`; there are no other features."""
+        del more
         self._writer.layout.check(images, state, action)
         for camera, image in images.items():
             stored = self._images[camera]

@@ -15,8 +15,9 @@ import pytest
 import concent_warp as cw
 from concent_warp.cli.entry import main
 from concent_warp.train.flow import frames as frame_files
-from concent_warp.train.flow.dataset import open_dataset, read_dataset
+from concent_warp.train.flow.dataset import read_dataset
 from concent_warp.train.flow.frames import FRAMES, NOTE, decode_episodes
+from concent_warp.train.flow.sources import open_dataset
 from tests.train.flow_dataset import DOWN, LENGTH, SIZE, TINY, UP, image, write_dataset
 
 QUICK = [

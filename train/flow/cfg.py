@@ -100,6 +100,9 @@ class FlowDataCfg:
     """Features of numbers that are the proprioception; by default "observation.state", else all "observation.*"."""
     action: tuple[str, ...] = ()
     """Features of numbers that are the action; by default "action", else all "action.*"."""
+    labels: bool = True
+    """Whether a chunk is what a teacher would have done from its frame on, where the data set has that (feature
+    "teacher_chunk"); else it is always what happened next."""
     validation: SmallShare = 0.05
     """Share of the episodes that is kept for validation, at least one; none where there is but one episode, or at 0."""
 

@@ -13,15 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.errors import RecordingError, TrainError
+from concent_warp.errors import TrainError
 from concent_warp.recording.logs.readers.lerobot import BOOKKEEPING, NUMBERS, SUCCESS, LeRobotLog
 from concent_warp.recording.logs.readers.log import Episode
 from concent_warp.train.flow.cfg import FlowDataCfg
+from concent_warp.train.flow.sources import EpisodeSources, open_dataset
 
 IMAGES = "observation.images."
 """Begins the names of features of images."""
 STATE, ACTION = "observation.state", "action"
 OBSERVATION, ACTIONS = "observation.", "action."
+LABELS = "teacher_chunk"
+"""Feature with the commands that a teacher would give from a frame on; NaN where it is the one that drives."""
+
+
+def label_names(action: Sequence[str], length: int) -> tuple[str, ...]:
+    """Return the names of the numbers of a label: those of the actions, each with its step."""
+    return tuple(f"{step}:{name}" for step in range(length) for name in action)
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,9 @@ class FlowDataset:
     """First frame of each episode, shape (E + 1,) int64, the last entry being T."""
     images: tuple[str, ...]
     """Features of the images, in the order of the cameras."""
+    labels: np.ndarray | None = None
+    """Chunks of a teacher from each frame on, shape (T, C, A) float32, NaN where the frames themselves go on as it
+    would; None where the data set has none."""
 
     @property
     def lengths(self) -> list[int]:
@@ -94,36 +105,37 @@ class FlowDataset:
         return np.concatenate(training), np.concatenate(validation or [np.zeros(0, dtype=np.int64)])
 
 
-def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
-    """Return numbers and texts of a data set.
+def read_dataset(log: EpisodeSources, cfg: FlowDataCfg) -> FlowDataset:
+    """Return numbers and texts of data sets.
 
     Args:
-        log: The data set.
+        log: The data sets.
         cfg: Which features.
 
     Raises:
-        TrainError: It lacks features or has no episodes, or a number is not finite.
+        TrainError: They lack features or have no episodes, or a number is not finite.
         RecordingError: A table is missing or cannot be read.
     """
-    source, chosen = log.source, _chosen_features(log, cfg)
-    numbers = log.numbers
-    if not numbers:
-        raise TrainError("the data set has no episodes", where=source)
-    tables, tasks, lengths = [], [], []
+    chosen = _chosen_of_all(log, cfg)
+    if not log.numbers:
+        raise TrainError("the data set has no episodes", where=log.source)
+    tables, tasks, lengths, labels = [], [], [], []
     names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
     size = (0, 0)
-    for number in numbers:
-        episode = log.episode(number)
-        found = tuple(_columns(episode, features, source) for features in (chosen.state, chosen.action))
+    for number in log.numbers:
+        episode, where = log.episode(number), log.where(number)
+        found = tuple(_columns(episode, features, where) for features in (chosen.state, chosen.action))
         now = (tuple(found[0]), tuple(found[1]))
         if names not in (None, now):
-            raise TrainError(
-                "an episode has other columns", where=f"{source}, episode {number}", expected=names, found=now
-            )
+            raise TrainError("an episode has other columns", where=where, expected=names, found=now)
         names, size = now, episode.images[chosen.cameras[0]].size
-        tables.append([_table(columns, f"{source}, episode {number}") for columns in found])
+        tables.append([_table(columns, where) for columns in found])
         tasks.append(episode.task)
         lengths.append(len(tables[-1][1]))
+        if cfg.labels and LABELS in log.features(number):
+            labels.append(_labels(episode, chosen.action, now[1], where))
+        else:
+            labels.append(None)
     assert names is not None
     texts = tuple(dict.fromkeys(tasks))
     cameras = tuple(name.removeprefix(IMAGES) for name in chosen.cameras)
@@ -134,30 +146,30 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
         np.repeat([texts.index(task) for task in tasks], lengths),
         np.concatenate([[0], np.cumsum(lengths)]),
         chosen.cameras,
+        _joined_labels(labels, lengths, len(names[1])),
     )
 
 
-def open_dataset(source: Path) -> LeRobotLog:
-    """Return a LeRobot data set.
+def check_features(sources: Sequence[Path], cfg: FlowDataCfg) -> None:
+    """Check that folders hold data sets with the chosen features, before anything is decoded.
 
     Raises:
-        RecordingError: There is none in the folder, or it is of another version.
+        TrainError: One lacks features, or they do not fit one another.
+        RecordingError: One is no LeRobot v3 data set.
     """
-    if not (source / "meta" / "info.json").is_file():
-        found = "no such folder" if not source.exists() else "a file" if source.is_file() else "no meta/info.json"
-        fix = "concent render and concent export --recording write one"
-        raise RecordingError("no LeRobot data set", where=source, expected="its folder", found=found, fix=fix)
-    return LeRobotLog(source)
+    _chosen_of_all(open_dataset(*sources), cfg)
 
 
-def check_features(source: Path, cfg: FlowDataCfg) -> None:
-    """Check that a folder holds a data set with the chosen features, before anything is decoded.
+def _chosen_of_all(log: EpisodeSources, cfg: FlowDataCfg) -> FlowDataCfg:
+    """Return the names of the features that are chosen; what is found in the first data set is expected of all.
 
     Raises:
-        TrainError: It lacks features.
-        RecordingError: It is no LeRobot v3 data set.
+        TrainError: One of the data sets lacks features.
     """
-    _chosen_features(open_dataset(source), cfg)
+    chosen = _chosen_features(log.logs[0], cfg)
+    for other in log.logs[1:]:
+        _chosen_features(other, chosen)
+    return chosen
 
 
 def _chosen_features(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataCfg:
@@ -187,7 +199,7 @@ def _chosen_features(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataCfg:
             raise TrainError(f"the data set has no such feature of {what}", where=where, expected=known, found=found)
         if len(set(names)) < len(names):
             raise TrainError(f"a feature of {what} is named twice", where=where, found=list(names))
-    return FlowDataCfg(tuple(cameras), tuple(state), tuple(action))
+    return FlowDataCfg(tuple(cameras), tuple(state), tuple(action), labels=cfg.labels)
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:
@@ -196,7 +208,7 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
     return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
 
 
-def _columns(episode: Episode, features: Sequence[str], source: Path) -> dict[str, np.ndarray]:
+def _columns(episode: Episode, features: Sequence[str], where: str) -> dict[str, np.ndarray]:
     """Return the columns (T,) of features by name.
 
     Raises:
@@ -206,7 +218,6 @@ def _columns(episode: Episode, features: Sequence[str], source: Path) -> dict[st
     for feature in features:
         columns = {n: s.value for n, s in episode.signals.items() if n == feature or n.startswith(f"{feature}/")}
         if not columns:
-            where = f"{source}, episode {episode.number}"
             raise TrainError("the table lacks a feature", where=where, expected=feature, found=sorted(episode.signals))
         # The names of the most common features are dropped: "observation.state/elbow" is "elbow".
         plain = feature in (STATE, ACTION) and len(features) == 1
@@ -226,3 +237,46 @@ def _table(columns: Mapping[str, np.ndarray], where: str) -> np.ndarray:
             fix = "mend the data set, or choose other features"
             raise TrainError(f"{name} is not finite", where=f"{where}, frame {row}", found=value[row], fix=fix)
     return np.stack(list(columns.values()), axis=1).astype(np.float32)
+
+
+def _labels(episode: Episode, features: Sequence[str], action: Sequence[str], where: str) -> np.ndarray:
+    """Return the labels of the frames of an episode, shape (T, C, A) float32; see `FlowDataset.labels`.
+
+    Args:
+        episode: The episode.
+        features: Chosen features of actions.
+        action: Names of the action's numbers.
+        where: The episode's place, for messages.
+
+    Raises:
+        TrainError: They are of other actions, or a label is finite in part.
+    """
+    if tuple(features) != (ACTION,):
+        fix = "choose no other actions, or set labels aside with --data.no-labels"
+        raise TrainError(f"{LABELS} labels other actions", where=where, expected=ACTION, found=list(features), fix=fix)
+    columns = {n.partition("/")[2]: s.value for n, s in episode.signals.items() if n.startswith(f"{LABELS}/")}
+    expected = label_names(action, len(columns) // len(action))
+    if not expected or tuple(columns) != expected:
+        raise TrainError(f"{LABELS} is of other actions", where=where, expected=expected[:3], found=list(columns)[:3])
+    found = np.stack(list(columns.values()), axis=1).astype(np.float32)
+    known = np.isfinite(found)
+    if (broken := known.any(axis=1) & ~known.all(axis=1)).any():
+        row = int(np.flatnonzero(broken)[0])
+        fix = "mend the data set, or set labels aside with --data.no-labels"
+        raise TrainError(f"{LABELS} is not finite in part", where=f"{where}, frame {row}", fix=fix)
+    return found.reshape(len(found), -1, len(action))
+
+
+def _joined_labels(parts: Sequence[np.ndarray | None], lengths: Sequence[int], width: int) -> np.ndarray | None:
+    """Return the labels of all episodes, as long as the shortest ones; None without any.
+
+    Args:
+        parts: Labels of each episode, (T, C, A), None where it has none.
+        lengths: Frames of each episode.
+        width: Numbers A of an action.
+    """
+    length = min((part.shape[1] for part in parts if part is not None), default=0)
+    if not length:
+        return None
+    unknown = (np.full((count, length, width), np.nan, dtype=np.float32) for count in lengths)
+    return np.concatenate([u if part is None else part[:, :length] for u, part in zip(unknown, parts, strict=True)])

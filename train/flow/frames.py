@@ -23,9 +23,9 @@ import torch
 from concent_warp.documents import read_json
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_json
-from concent_warp.recording.logs.readers.lerobot import LeRobotLog
 from concent_warp.run_folder import make_folder
 from concent_warp.train.flow.network import prepared
+from concent_warp.train.flow.sources import EpisodeSources
 
 FRAMES = "frames"
 """Folder of the files within a run folder."""
@@ -62,7 +62,7 @@ class FrameFiles:
 
 
 def decode_episodes(
-    log: LeRobotLog,
+    log: EpisodeSources,
     cameras: Sequence[str],
     edge: int,
     lengths: Sequence[int],
@@ -73,7 +73,7 @@ def decode_episodes(
     """Decode the images of all episodes, or go on with it.
 
     Args:
-        log: The data set.
+        log: The data sets.
         cameras: Features of images.
         edge: Height and width to which images are resized [px].
         lengths: Frames of each episode.
@@ -125,7 +125,7 @@ def decode_episodes(
     return FrameFiles(files, total, edge)
 
 
-def _episode_images(log: LeRobotLog, number: int, cameras: Sequence[str], edge: int) -> list[np.ndarray]:
+def _episode_images(log: EpisodeSources, number: int, cameras: Sequence[str], edge: int) -> list[np.ndarray]:
     """Return the images of an episode by camera, each (T, S, S, 3) uint8."""
     episode, found = log.episode(number), []
     for camera in cameras:
@@ -139,10 +139,12 @@ def _episode_images(log: LeRobotLog, number: int, cameras: Sequence[str], edge: 
     return found
 
 
-def _fingerprint(log: LeRobotLog, lengths: Sequence[int]) -> str:
-    """Return what tells one data set from another: its place, its description and the lengths of its episodes."""
-    described = (log.source / "meta" / "info.json").read_bytes()
-    return hashlib.sha256(f"{log.source.resolve()}{list(lengths)}".encode() + described).hexdigest()
+def _fingerprint(log: EpisodeSources, lengths: Sequence[int]) -> str:
+    """Return what tells data sets from others: their places, their descriptions and the lengths of their episodes."""
+    found = hashlib.sha256(f"{list(lengths)}".encode())
+    for one in log.logs:
+        found.update(f"{one.source.resolve()}".encode() + (one.source / "meta" / "info.json").read_bytes())
+    return found.hexdigest()
 
 
 def _episodes_done(

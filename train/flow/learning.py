@@ -96,6 +96,7 @@ class FlowTraining:
             self._check_size()
         self._state, self._action = (torch.from_numpy(values).to(self.device) for values in (data.state, data.action))
         self._task, self._last = (torch.from_numpy(v).to(self.device) for v in (data.task, data.last()))
+        self._take_labels()
         self._images: torch.Tensor | list[np.ndarray] = []
 
     def learn(self, report: Callable[[FlowStep], None] | None = None) -> None:
@@ -195,10 +196,41 @@ class FlowTraining:
         """Return the losses of frames (N,) with images (N, K, 3, S, S) in 0..1, shape (N,)."""
         task = self._task[rows]
         context, mask = network.context(images, self._state[rows], self.ids[task], self.mask[task], blank)
-        actions = self._action[self._ahead(rows)]
+        actions = self._chunks(rows)
         given: dict[str, Any] = {"device": self.device, "generator": generator}
         noise = torch.randn(actions.shape, **given)
         return network.loss(context, mask, actions, noise, torch.rand(len(rows), **given))
+
+    def _take_labels(self) -> None:
+        """Keep the labels of the frames that have one.
+
+        Raises:
+            TrainError: They are shorter than the policy's chunks.
+        """
+        labels, length = self.data.labels, self.cfg.policy.chunk
+        self._labels: tuple[torch.Tensor, torch.Tensor] | None = None
+        if labels is None:
+            return
+        if labels.shape[1] < length:
+            fix = "render them with a longer --handover.chunk, choose a shorter --policy.chunk, or --data.no-labels"
+            raise TrainError(
+                "labels of the data set are shorter than the policy's chunks", expected=f"at least {length} commands",
+                found=labels.shape[1], fix=fix,
+            )  # fmt: skip
+        rows = np.flatnonzero(np.isfinite(labels[:, 0, 0]))
+        row_of = np.zeros(len(labels), dtype=np.int64)  # row 0 stands for none
+        row_of[rows] = 1 + np.arange(len(rows))
+        kept = np.concatenate([np.zeros_like(labels[:1, :length]), labels[rows, :length]])
+        self._labels = torch.from_numpy(row_of).to(self.device), torch.from_numpy(kept).to(self.device)
+
+    def _chunks(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the chunks that frames (N,) are to predict, shape (N, C, A): labels where there are any."""
+        shown = self._action[self._ahead(rows)]
+        if self._labels is None:
+            return shown
+        row_of, labels = self._labels
+        label = row_of[rows]
+        return torch.where((label > 0)[:, None, None], labels[label], shown)
 
     def _ahead(self, rows: torch.Tensor) -> torch.Tensor:
         """Return the frames whose actions are the chunks of frames (N,), shape (N, C): the last one of an episode stays

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from concent_warp.errors import TrainError
 from concent_warp.train.distil.images import ImageSource
+from concent_warp.train.environment.command_steps import CommandSteps
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.flow.policy import FlowPolicy
 from concent_warp.train.flow.receding_horizon import RecedingHorizon
@@ -76,29 +77,21 @@ class TaskFlowPolicy:
         Raises:
             TrainError: The task lacks a camera, joint or actuator of the policy, or moves at another rate.
         """
-        model, robot, physics = environment.task.compiled, environment.task.robot, environment.physics
+        model, physics = environment.task.compiled, environment.physics
         features = self.policy.features
         joints = {model.joint(j).name: int(model.jnt_qposadr[j]) for j in range(model.njnt)}
-        actuators = {model.actuator(i).name: i for i in range(model.nu)}
         for what, needed, known in (
             ("camera", features.cameras, images.cameras), ("joint", features.state, joints),
-            ("actuator", features.action, actuators),
         ):  # fmt: skip
             if missing := [name for name in needed if name not in known]:
                 raise TrainError(f"the task has no {what} of the policy", expected=missing[0], found=list(known))
+        steps = CommandSteps(environment, features.action)
         if abs(features.rate * environment.control_step - 1) > 1e-6:
             found = f"{1 / environment.control_step:g} Hz"
             raise TrainError(
                 "the task moves at another rate than the policy", expected=f"{features.rate:g} Hz", found=found
             )
         state = torch.tensor([joints[name] for name in features.state])
-        columns = {name: k for k, name in enumerate(features.action)}
-        arm = [columns.get(model.actuator(i).name) for i in robot.actuator]
-        hand = [columns[name] for i in robot.gripper if (name := model.actuator(i).name) in columns]
-        if None in arm or (len(robot.gripper) and not hand):
-            names = [model.actuator(i).name for i in [*robot.actuator, *robot.gripper]]
-            raise TrainError("the policy does not move the whole robot", expected=names, found=list(features.action))
-        step = torch.as_tensor(robot.step, dtype=torch.float32)
         horizon = RecedingHorizon(self.policy, self.instruction)
         cameras = [list(images.cameras).index(name) for name in features.cameras]
 
@@ -110,12 +103,6 @@ class TaskFlowPolicy:
             shown = {name: seen[:, k] for name, k in zip(features.cameras, cameras, strict=True)}
             felt = physics.qpos if environment.estimate is None else environment.estimate.qpos
             own = felt[:, state.to(felt.device)]
-            wanted = torch.from_numpy(horizon.act(shown, own, started.cpu().numpy())).to(physics.ctrl.device)
-            present = physics.ctrl[:, robot.actuator.tolist()]
-            moves = wanted[:, arm] - present
-            if hand:
-                grip = wanted[:, hand].mean(dim=1) - physics.ctrl[:, robot.gripper.tolist()].mean(dim=1)
-                moves = torch.cat([moves, grip[:, None]], dim=1)
-            return (moves / step.to(moves.device)).clamp(-1, 1).to(environment.device)
+            return steps.actions(torch.from_numpy(horizon.act(shown, own, started.cpu().numpy())))
 
         return act

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +15,11 @@ from concent_warp.checks import check_device
 from concent_warp.files import write_text
 from concent_warp.run_folder import SETTINGS, TRAIN_CHECKPOINT, check_unchanged, plain, run_folder, write_settings
 from concent_warp.train.flow.cfg import FLOW_SETTINGS, TrainFlowCfg, check_train_cfg
-from concent_warp.train.flow.dataset import check_features, open_dataset, read_dataset
+from concent_warp.train.flow.dataset import check_features, read_dataset
 from concent_warp.train.flow.frames import decode_episodes, remove_frames
 from concent_warp.train.flow.learning import FlowStep, FlowTraining
 from concent_warp.train.flow.policy import POLICY, FlowPolicy, policy_of, write_policy
+from concent_warp.train.flow.sources import open_dataset
 
 FREE = ("dataset", "checkpoint", "device_share")
 """Settings that may differ when a training is continued: where the data set is, and those without influence."""
@@ -45,7 +46,7 @@ class FlowProgress:
 
 
 def train_flow(
-    dataset: str | Path,
+    dataset: str | Path | Sequence[str | Path],
     cfg: TrainFlowCfg | None = None,
     *,
     device: str | None = None,
@@ -54,13 +55,14 @@ def train_flow(
     overwrite: bool = False,
     progress: Callable[[FlowProgress], None] | None = None,
 ) -> FlowPolicy:
-    """Train a policy from images, proprioception and text to chunks of actions on a LeRobot v3 data set.
+    """Train a policy from images, proprioception and text to chunks of actions on LeRobot v3 data sets.
 
     The policy is a rectified flow after FLOWER (Reuss et al., CoRL 2025): tokens of images and text condition a
     transformer by cross-attention, which turns noise into a chunk of actions.
 
     Args:
-        dataset: Folder of the data set, as `render` and `write_lerobot` write it, or a user's own.
+        dataset: Folder of the data set, as `render` and `write_lerobot` write it, or a user's own; or the folders of
+            several, with the same cameras, states and actions.
         cfg: Settings.
         device: Torch's name of the device; the first CUDA device by default, the CPU without one.
         out: Run folder for the policy, checkpoints and metrics; None writes none.
@@ -86,31 +88,33 @@ def train_flow(
         >>> policy.features.cameras
         ('base',)
     """
-    cfg, source = cfg or TrainFlowCfg(), Path(dataset)
+    cfg, given = cfg or TrainFlowCfg(), [dataset] if isinstance(dataset, str | Path) else dataset
+    sources = [Path(one) for one in given]
     check_train_cfg(cfg)
     check_device(device)
-    check_features(source, cfg.data)
+    check_features(sources, cfg.data)
     report = progress or _ignore
     where = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     with ExitStack() as stack:
         if out is None:
             place = Path(stack.enter_context(TemporaryDirectory()))
-            return _trained(source, cfg, place, where, report, folder=None)
+            return _trained(sources, cfg, place, where, report, folder=None)
         claimed = stack.enter_context(run_folder(Path(out), overwrite=overwrite, resume=resume, keep_folders=False))
-        settings = {"dataset": str(source), **plain(cfg)}
+        named = [str(one) for one in sources]
+        settings = {"dataset": named[0] if len(named) == 1 else named, **plain(cfg)}
         if resume and (claimed.path / TRAIN_CHECKPOINT).exists():
             check_unchanged(claimed.path / SETTINGS, settings, FREE)
             if (claimed.path / POLICY).is_file():
                 return FlowPolicy.load(claimed.path, device=where)
         write_settings(claimed.path, settings)
         write_text(claimed.path / FLOW_SETTINGS, tomli_w.dumps(plain(cfg)))
-        _trained(source, cfg, claimed.path, where, report, folder=claimed.path)
+        _trained(sources, cfg, claimed.path, where, report, folder=claimed.path)
         path = claimed.commit()
         return FlowPolicy.load(path, device=where)
 
 
 def _trained(
-    source: Path,
+    sources: Sequence[Path],
     cfg: TrainFlowCfg,
     place: Path,
     device: str,
@@ -121,14 +125,14 @@ def _trained(
     """Train, and return the policy.
 
     Args:
-        source: Folder of the data set.
+        sources: Folders of the data sets.
         cfg: Settings.
         place: Folder for decoded images.
         device: Torch's name of the device.
         report: Told about the progress.
         folder: Run folder, where a checkpoint is gone on with if there is one; None for none.
     """
-    log = open_dataset(source)
+    log = open_dataset(*sources)
     data = read_dataset(log, cfg.data)
     training = FlowTraining(data, cfg, folder, device=device)
     if folder is not None and (folder / TRAIN_CHECKPOINT).exists():

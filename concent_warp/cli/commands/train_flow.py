@@ -28,8 +28,8 @@ class Arguments:
     Writes the policy to a run folder, with curves for TensorBoard. Ctrl-C loses nothing.
     """
 
-    dataset: tyro.conf.Positional[Path]
-    """Folder of the data set."""
+    dataset: tyro.conf.Positional[tuple[Path, ...]]
+    """Folder of the data set, or folders of several."""
     out: OutPath = Path("runs/flow")
     """Run folder."""
     cameras: tuple[str, ...] = ()
