@@ -150,7 +150,7 @@ def _rounds(policy: Policy, hidden: EvaluateCfg, seed: int, folder: Path, args: 
         rounds=args.rounds, target=1.0, episodes=args.episodes, iterations=args.iterations, worlds=args.worlds,
         seed=1000 * seed, explain=ExplainCfg(seconds=args.seconds, jobs=jobs, seed=seed), evaluate=hidden,
     )  # fmt: skip
-    found = improve(policy, policy.run.recording, cfg=cfg, world="reality", device=args.device, out=folder)
+    found = improve(policy, policy.run.recording, cfg, world="reality", device=args.device, out=folder)
     return load_policy(Path(found.policy)), {
         "ending": found.ending,
         "by round": [[one.successes, one.trials] for one in found.rounds],

@@ -59,7 +59,9 @@ def interrupted(policy: cw.Policy, trials: Path, tmp_path_factory: pytest.TempPa
 
         shares: list[float] = []
         try:
-            return cw.improve(policy, policy.run.recording, trials, CFG, device="cpu", out=out, progress=progress)
+            return cw.improve(
+                policy, policy.run.recording, CFG, trials=trials, device="cpu", out=out, progress=progress
+            )
         finally:
             assert shares == sorted(shares)
 
@@ -124,9 +126,9 @@ def test_it_goes_on_with_trials_of_the_new_policy(policy: cw.Policy, interrupted
     (trials / "round_2").mkdir()
     try:
         write_hdf5(replace(recording, demonstrations=better), trials / "round_2" / "robot.h5")
-        found = cw.improve(policy, policy.run.recording, trials, CFG, device="cpu", out=interrupted)
+        found = cw.improve(policy, policy.run.recording, CFG, trials=trials, device="cpu", out=interrupted)
         reached = replace(CFG, target=0.5)
-        also = cw.improve(policy, policy.run.recording, trials, reached, device="cpu", out=interrupted)
+        also = cw.improve(policy, policy.run.recording, reached, trials=trials, device="cpu", out=interrupted)
     finally:
         shutil.rmtree(trials / "round_2")
     assert (found.ending, also.ending) == ("rounds", "target")
@@ -137,7 +139,7 @@ def test_it_goes_on_with_trials_of_the_new_policy(policy: cw.Policy, interrupted
 
 def test_in_reality_the_policy_is_tried_by_the_tool(policy: cw.Policy, tmp_path: Path) -> None:
     cfg = replace(CFG, episodes=2, target=0.0)
-    found = cw.improve(policy, policy.run.recording, cfg=cfg, world="reality", device="cpu", out=tmp_path / "out")
+    found = cw.improve(policy, policy.run.recording, cfg, world="reality", device="cpu", out=tmp_path / "out")
     assert found.ending == "target"
     assert trial_files(tmp_path / "out" / "round_1", 1) == []
     (command,) = found.rounds[0].commands
@@ -250,7 +252,7 @@ def test_the_chart_has_a_point_and_an_interval_for_each_round() -> None:
 
 def test_other_trials_and_settings_are_refused(policy: cw.Policy, interrupted: Path, trials: Path) -> None:
     def again(cfg: cw.ImproveCfg) -> None:
-        cw.improve(policy, policy.run.recording, trials, cfg, device="cpu", out=interrupted)
+        cw.improve(policy, policy.run.recording, cfg, trials=trials, device="cpu", out=interrupted)
 
     with pytest.raises(cw.ConcentError, match=r"begun with other settings.*worlds 4.*worlds 8"):
         again(replace(CFG, worlds=8))
@@ -267,35 +269,25 @@ def test_other_trials_and_settings_are_refused(policy: cw.Policy, interrupted: P
 def test_wrong_input_is_refused_before_anything_is_written(policy: cw.Policy, trials: Path, tmp_path: Path) -> None:
     out, recording = tmp_path / "out", policy.run.recording
 
-    def refused(words: str, *arguments: Any, **options: Any) -> None:
+    def refused(words: str, folder: Path | None, cfg: cw.ImproveCfg = CFG, **options: Any) -> None:
         with pytest.raises(cw.ConcentError, match=words):
-            cw.improve(policy, *arguments, **{"out": out, **options})
+            cw.improve(policy, options.pop("recording", recording), cfg, trials=folder, out=out, **options)
         assert not out.exists()
 
     other = replace(recording, demonstrations=(replace(recording[0], name="demo_7"),))
-    refused("lacks the demonstration.*expected demo_0.*found demo_7", other, trials)
-    refused("no trials are given", recording)
-    refused("no such folder of trials", recording, tmp_path / "gone")
+    refused("lacks the demonstration.*expected demo_0.*found demo_7", trials, recording=other)
+    refused("no trials are given", None)
+    refused("no such folder of trials", tmp_path / "gone")
     (tmp_path / "empty").mkdir()
-    refused("there are no trials", recording, tmp_path / "empty")
-    refused("rounds", recording, trials, cw.ImproveCfg(rounds=0))
-    refused(
-        "hidden effects exist only in Reality",
-        recording,
-        trials,
-        cw.ImproveCfg(evaluate=cw.EvaluateCfg(hide=("backlash=1",))),
-    )
-    refused(
-        "no effect .magic. can be hidden",
-        recording,
-        trials,
-        cw.ImproveCfg(evaluate=cw.EvaluateCfg(hide=("magic=1",))),
-        world="reality",
-    )
+    refused("there are no trials", tmp_path / "empty")
+    refused("rounds", trials, cw.ImproveCfg(rounds=0))
+    backlash, magic = (cw.ImproveCfg(evaluate=cw.EvaluateCfg(hide=(one,))) for one in ("backlash=1", "magic=1"))
+    refused("hidden effects exist only in Reality", trials, backlash)
+    refused("no effect .magic. can be hidden", trials, magic, world="reality")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(cw.ConcentError, match="other things than rounds"):
-        cw.improve(policy, recording, trials, out=tmp_path / "mine", overwrite=True)
+        cw.improve(policy, recording, trials=trials, out=tmp_path / "mine", overwrite=True)
     assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
 
 
@@ -306,7 +298,7 @@ def test_a_damaged_state_is_one_sentence(policy: cw.Policy, interrupted: Path, t
         for text in ("{", '{"number": 1}', kept.replace('"explain"', '"dance"')):
             state.write_text(text)
             with pytest.raises(cw.TrainError, match=r"round.json.*--overwrite"):
-                cw.improve(policy, policy.run.recording, trials, CFG, device="cpu", out=interrupted)
+                cw.improve(policy, policy.run.recording, CFG, trials=trials, device="cpu", out=interrupted)
     finally:
         state.write_text(kept)
 

@@ -83,8 +83,8 @@ def _improved(arguments: Arguments, policy: Policy, recording: Recording, folder
             return improve(
                 policy,
                 recording,
-                arguments.trials,
                 arguments.cfg,
+                trials=arguments.trials,
                 world=arguments.world,
                 device=arguments.device,
                 out=folder,

@@ -50,9 +50,9 @@ FREE = ("rounds", "target")
 def improve(
     policy: Policy,
     recording: Recording,
-    trials: str | Path | None = None,
     cfg: ImproveCfg | None = None,
     *,
+    trials: str | Path | None = None,
     world: ImproveWorld = "robot",
     device: str | None = None,
     out: str | Path = "runs/improve",
@@ -66,9 +66,9 @@ def improve(
     Args:
         policy: The policy to begin with, in its run folder.
         recording: Recording with the demonstration that it was trained from.
+        cfg: Settings.
         trials: Folder with recordings of trials (``.h5``): of the first round in it or in ``round_1``, of later rounds
             in ``round_2`` and so on. In Reality trials that are not given are made.
-        cfg: Settings.
         world: "robot": where the trials of a round are missing, it ends, to be called again with them. "reality": each
             policy is tried in Reality.
         device: Warp's name of the device; the first CUDA device by default, the CPU without one.
@@ -87,7 +87,7 @@ def improve(
         >>> policy = cw.load_policy("shape_sorter")
         >>> slow = cw.EvaluateCfg(action_scale=0.05)
         >>> cfg = cw.ImproveCfg(rounds=1, episodes=2, target=0.0, evaluate=slow)
-        >>> improved = cw.improve(policy, policy.run.recording, cfg=cfg, world="reality", out="rounds", device="cpu")
+        >>> improved = cw.improve(policy, policy.run.recording, cfg, world="reality", out="rounds", device="cpu")
         >>> improved.ending, improved.rounds[0].trials
         ('target', 2)
     """
