@@ -281,6 +281,7 @@ def test_wrong_input_is_refused_before_anything_is_written(policy: cw.Policy, tr
     (tmp_path / "empty").mkdir()
     refused("there are no trials", tmp_path / "empty")
     refused("rounds", trials, cw.ImproveCfg(rounds=0))
+    refused("no effect 'magic'", trials, cw.ImproveCfg(explain=cw.ExplainCfg(effects=("magic",))))
     backlash, magic = (cw.ImproveCfg(evaluate=cw.EvaluateCfg(hide=(one,))) for one in ("backlash=1", "magic=1"))
     refused("hidden effects exist only in Reality", trials, backlash)
     refused("no effect .magic. can be hidden", trials, magic, world="reality")
@@ -327,6 +328,9 @@ def test_the_command_prints_the_rounds(policy: cw.Policy, monkeypatch: Any, tmp_
     assert "concent suggest" in said
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(found.to_json()))
+    monkeypatch.chdir(tmp_path)
+    assert main([word for word in words if word not in ("--policy", "shape_sorter")]) == 2
+    assert "name it with --policy" in capsys.readouterr().err
 
 
 def test_effects_of_an_explanation_are_named_without_what_they_act_on() -> None:

@@ -13,6 +13,7 @@ from rich.markup import escape
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.deploy.improve.cfg import ImproveCfg, ImproveWorld
+from concent_warp.errors import TrainError
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import check_folder, command_line
 
@@ -57,6 +58,8 @@ def run(arguments: Arguments) -> Improved:
     from concent_warp.train.policy.load import load_policy
 
     default = Path("runs") / f"train_{arguments.recording.stem}"
+    if arguments.policy is None and not default.exists():
+        raise TrainError("no policy is given, and the default is not there", where=default, fix="name it with --policy")
     policy = load_policy(default if arguments.policy is None else arguments.policy)
     found = _improved(arguments, policy, recording, folder)
     if arguments.json:

@@ -28,6 +28,7 @@ from concent_warp.deploy.improve.steps import (
     with_effects,
 )
 from concent_warp.diagnosis.tasks import Progress, ignore_progress
+from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError, RecordingError, TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.recording.recording import Recording
@@ -79,7 +80,7 @@ def improve(
     Raises:
         TrainError: A setting is out of bounds, or trials changed after their round had begun.
         RecordingError: There are no trials for the first round, or the recording lacks the policy's demonstration.
-        ModelError: Trials are of another robot than the policy's model.
+        ModelError: Trials are of another robot than the policy's model, or there is no effect of a given name.
         ConcentError: The folder holds rounds with other settings, or other things.
 
     Example:
@@ -94,6 +95,8 @@ def improve(
     cfg = cfg or ImproveCfg()
     check_settings(cfg, TrainError)
     check_device(device)
+    for effect in cfg.explain.effects:
+        effect_class(effect)
     folder, given = Path(out), None if trials is None else Path(trials)
     _check_world(cfg.evaluate, world, given)
     name = policy.run.recording[0].name
