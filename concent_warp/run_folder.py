@@ -419,17 +419,8 @@ def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
     return document
 
 
-def check_unchanged(
-    path: Path, settings: Mapping[str, Any], free: Collection[str] = FREE, *, needs_resume: bool = True
-) -> None:
-    """Raise an error where settings other than those in `free` differ from a settings file.
-
-    Args:
-        path: The settings file.
-        settings: Settings.
-        free: Names of settings that may differ.
-        needs_resume: Whether the command continues with ``--resume`` only.
-    """
+def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[str] = FREE, *, resume: str = "") -> None:
+    """Raise an error where settings other than `free` differ from a file's; `resume` is what continues the run then."""
     try:
         stored = tomllib.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
@@ -437,14 +428,13 @@ def check_unchanged(
     before, now = _flat(stored.get("settings", {})), _flat(settings)
     differing = [n for n in sorted(before | now) if n.split(".")[0] not in free and before.get(n) != now.get(n)]
     if differing:
-        command = stored.get("command", "")
-        command = _resuming(shlex.split(command)) if needs_resume else command
+        command = resume or f"`{_resuming(shlex.split(stored.get('command', '')))}`"
         raise ConcentError(
             "this run was begun with other settings",
             where=path.parent,
             expected=", ".join(f"{name} {before.get(name)}" for name in differing),
             found=", ".join(f"{name} {now.get(name)}" for name in differing),
-            fix=f"continue with `{command}`, or start anew with --overwrite",
+            fix=f"continue with {command}, or start anew with --overwrite",
         )
 
 

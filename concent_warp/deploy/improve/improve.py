@@ -115,7 +115,7 @@ def improve(
     with lock_folder(folder):
         if overwrite:
             _remove_rounds(folder)
-        check_unchanged(folder / SETTINGS, settings, FREE, needs_resume=False)
+        check_unchanged(folder / SETTINGS, settings, FREE, resume="the settings it was begun with")
         write_settings(folder, settings)
         setting = Setting(recording.only([name]), cfg, device)
         return _Improving(setting, policy, given, world, folder, progress or ignore_progress).run()
