@@ -25,6 +25,9 @@ _HOMES = {
     "deploy.explain.explain": ("explain",),
     "deploy.explain.page": ("write_explanation",),
     "deploy.explain.result": ("Explanation", "TrialExplanation"),
+    "deploy.improve.cfg": ("ImproveCfg",),
+    "deploy.improve.improve": ("improve",),
+    "deploy.improve.rounds": ("Improved", "MissingEffect", "ImprovementRound"),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
     "deploy.trial_environment": ("TrialEnvironment", "TrialObservation", "TrialStep"),
@@ -119,6 +122,9 @@ if TYPE_CHECKING:
     from concent_warp.deploy.explain.explain import explain
     from concent_warp.deploy.explain.page import write_explanation
     from concent_warp.deploy.explain.result import Explanation, TrialExplanation
+    from concent_warp.deploy.improve.cfg import ImproveCfg
+    from concent_warp.deploy.improve.improve import improve
+    from concent_warp.deploy.improve.rounds import Improved, ImprovementRound, MissingEffect
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
     from concent_warp.deploy.trial_environment import TrialEnvironment, TrialObservation, TrialStep

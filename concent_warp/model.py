@@ -14,7 +14,7 @@ import numpy as np
 from concent_warp.documents import is_number, read_toml
 from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
 from concent_warp.effects.registry import effect_class
-from concent_warp.effects.table import checked_values, effects_table, read_effects
+from concent_warp.effects.table import checked_values, effects_table, posteriors_table, read_effects, with_posteriors
 from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none, write_text
 from concent_warp.recording.recording import Recording
@@ -203,6 +203,8 @@ class Model:
         document["contact"] = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self.contact).items()}
         if self.effects:
             document["effect"] = effects_table(self.effects)
+        if posteriors := posteriors_table(self.effects):
+            document["posterior"] = posteriors
         with all_or_none():
             write_text(path.with_name(document["scene"]), self.scene.xml)
             if self.geometry is not None:
@@ -229,7 +231,7 @@ class Model:
             raise ModelError(
                 "unknown version of the model file", where=path, expected=VERSION, found=document.get("version")
             )
-        known = {"format", "version", "scene", "geometry", "contact", "effect"}
+        known = {"format", "version", "scene", "geometry", "contact", "effect", "posterior"}
         if unknown := sorted(set(document) - known):
             raise ModelError(
                 "unknown entries in the model file", where=path, expected=f"only {sorted(known)}", found=unknown
@@ -249,7 +251,7 @@ class Model:
                 raise ModelError("the contact geometry names bodies that the scene lacks", where=path, found=missing)
         for added in read_effects(document.get("effect", []), path):
             model = replace(model.add(added.effect, added.values), effects=(*model.effects, added))
-        return model
+        return replace(model, effects=tuple(with_posteriors(model.effects, document.get("posterior", []), path)))
 
 
 def _contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameters:

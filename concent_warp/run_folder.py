@@ -419,8 +419,8 @@ def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
     return document
 
 
-def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[str] = FREE) -> None:
-    """Raise an error where settings other than those in `free` differ from a settings file."""
+def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[str] = FREE, *, resume: str = "") -> None:
+    """Raise an error where settings other than `free` differ from a file's; `resume` is what continues the run then."""
     try:
         stored = tomllib.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
@@ -428,12 +428,13 @@ def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[st
     before, now = _flat(stored.get("settings", {})), _flat(settings)
     differing = [n for n in sorted(before | now) if n.split(".")[0] not in free and before.get(n) != now.get(n)]
     if differing:
+        command = resume or f"`{_resuming(shlex.split(stored.get('command', '')))}`"
         raise ConcentError(
             "this run was begun with other settings",
             where=path.parent,
             expected=", ".join(f"{name} {before.get(name)}" for name in differing),
             found=", ".join(f"{name} {now.get(name)}" for name in differing),
-            fix=f"continue with `{_resuming(shlex.split(stored.get('command', '')))}`, or start anew with --overwrite",
+            fix=f"continue with {command}, or start anew with --overwrite",
         )
 
 

@@ -21,8 +21,8 @@ ABOUT_WARP = (
     *("concent_warp.kernels", "concent_warp.train", "concent_warp.render", "concent_warp.simulate.warp_"),
     *("concent_warp.deploy.evaluate", "concent_warp.deploy.play", "concent_warp.deploy.reality_world"),
     *("concent_warp.deploy.distil", "concent_warp.deploy.simulated_images", "concent_warp.deploy.reality_images"),
-    *("concent_warp.deploy.explain.", "concent_warp.deploy.handover", "concent_warp.deploy.record_trials"),
-    "concent_warp.deploy.trial_environment",
+    *("concent_warp.deploy.explain.", "concent_warp.deploy.improve.", "concent_warp.deploy.trial_environment"),
+    *("concent_warp.deploy.handover", "concent_warp.deploy.record_trials"),
 )
 """Modules that are all about such a package: whoever needs them imports them where needed."""
 ANSWER = 1.0

@@ -25,6 +25,7 @@ NEEDED = {
     "train-flow": "dataset --device cpu -o out",
     "evaluate": "--pretrained --device cpu",
     "explain": "shape_sorter recording.h5 -o out",
+    "improve": "recording.h5 --policy shape_sorter --trials trials -o out",
     "play": "--pretrained",
     "export": "--pretrained -o out.onnx",
     "splat-fit": "images -o out",
@@ -38,7 +39,7 @@ NEEDED = {
 }
 """What each command needs besides the option that is wrong."""
 SIGNED = (
-    "--jobs", "--eye", "--lights.ground", "--reality.expert.grip-height", "--reality.sensing.camera-position",
+    "jobs", "--eye", "--lights.ground", "--reality.expert.grip-height", "--reality.sensing.camera-position",
     "--reality.sensing.camera-target", "--environment.reward.engineered.hole", "--environment.reward.engineered.seat",
     "-position", "-yaw", "-bias", "--start", "--limits.workspace",
 )  # fmt: skip
@@ -95,6 +96,11 @@ WRONG = {
     "explain": (
         "gone.h5", "--effects magic", "--jobs 0", "--action-scale 0", "--html scene.xml", "--most-trials 0",
         "--seed -1",
+    ),
+    "improve": (
+        "--policy gone", "--world moon", "--trials gone", "--trials recording.h5", "--rounds 0", "--target 2",
+        "--evaluate.hide magic=1", "--world reality --evaluate.hide magic", "-o scene.xml", "--device cuda:7",
+        "--explain.effects magic",
     ),
     "play": (
         "--port -1", "--port 70000", "--device cuda:7", "--world both", "--episodes 0", "--speed 0",

@@ -115,6 +115,12 @@ WRITING = [
         f"explain {{inputs}}/{TRAINED} {{inputs}}/{TRIALS} --no-diagnose --most-trials 1 --repetitions 2 "
         "--html {out}/page.html --out {out}/run",
     ),
+    Writing(
+        "improve",
+        f"improve {SHIPPED}/demonstration.h5 --policy {{inputs}}/{TRAINED} --trials {{inputs}}/{TRIALS} --rounds 1 "
+        "--iterations 2 --worlds 4 --explain.no-diagnose --explain.most-trials 1 --explain.repetitions 2 "
+        "--explain.simulated 2 --device cpu --out {out}/run",
+    ),
     Writing("export, ONNX", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.onnx"),
     Writing("export, TorchScript", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.pt"),
     Writing("export, pretrained", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy --as-pretrained"),

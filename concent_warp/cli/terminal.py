@@ -121,19 +121,22 @@ def _no_native_output() -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar with an estimate of the time left; what is given is to be called with the share done, 0..1."""
+def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+    """Show a bar with an estimate of the time left.
+
+    What is given is to be called with the share done, 0..1, and where that is known a text on what is being done.
+    """
     with status_bar(title) as update:
         first: tuple[float, float] | None = None
 
-        def show(share: float) -> None:
+        def show(share: float, text: str = "") -> None:
             # What was done before, by a run that is continued, took none of this time.
             nonlocal first
             now = time.monotonic()
             first = first or (share, now)
             done = share - first[0]
             known = done > 0.02 * (1 - first[0])
-            update(share, "", (now - first[1]) * (1 - share) / done if known else math.nan)
+            update(share, text, (now - first[1]) * (1 - share) / done if known else math.nan)
 
         yield show
 

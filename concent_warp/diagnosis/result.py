@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from concent_warp.comparison.units import p_value_text
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
 from concent_warp.diagnosis.result_html import diagnosis_html
+from concent_warp.effects.table import posteriors_table
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
@@ -255,6 +256,7 @@ class Diagnosis:
             "form_error": self.form_error,
             "time_step": None if self.time_step is None else self.time_step.to_json(),
             "nominal_values": [_parameter(p) for p in self.nominal_values],
+            "posterior": self._posterior(),
             "ratio": list(self.ratio),
             "detectable": [
                 {"name": d.name, "parameter": d.parameter, "size": _number(d.size), "unit": d.unit}
@@ -266,6 +268,27 @@ class Diagnosis:
             "versions": dict(self.versions),
             "seed": self.seed,
         }
+
+    def _posterior(self) -> dict[str, Any] | None:
+        """Return the joint posterior of the parameters of `model` in plain types; None where there is none."""
+        effects = [a for a in self.model.effects if a.posterior is not None] if self.changes_model else []
+        if not effects:
+            return None
+        bare = replace(self.model, effects=()).compile()
+        (row, *_) = posteriors_table(effects)
+        members = [effects[k] for k in row["effects"]]
+        named = [(a.effect.name, p) for a in members for p in a.effect.parameters(bare)]
+        values = [v for a in members for v in a.values]
+        return {
+            "parameters": [
+                {"effect": name, "name": p.name, "value": _number(value), "unit": p.unit, "scale": scale,
+                 "bounds": [_number(low), _number(high)]}
+                for (name, p), value, scale, low, high in zip(
+                    named, values, row["scale"], row["low"], row["high"], strict=True
+                )
+            ],
+            "covariance": row["covariance"],
+        }  # fmt: skip
 
     def _repr_html_(self) -> str:
         """Return the verdict and the accepted effects as HTML, for notebooks."""

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import mujoco
 import numpy as np
 
+from concent_warp.effects.posterior import JointPosterior
 from concent_warp.errors import ModelError
 
 if TYPE_CHECKING:
@@ -270,6 +271,10 @@ class AddedEffect:
     """Values, in the order of `Effect.parameters`."""
     intervals: tuple[tuple[float, float], ...] = ()
     """95 % intervals of the values, where they are known."""
+    posterior: JointPosterior | None = None
+    """Distribution of the values together with those of other effects that were fitted with it, where it is known."""
+    first: int = 0
+    """Index in it of the first value."""
 
     @cached_property
     def array(self) -> np.ndarray:

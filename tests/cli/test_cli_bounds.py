@@ -27,11 +27,12 @@ BAD = {"FLOAT": (-1.0, float("nan"), float("inf"), 1e300), "INT": (-1, 10**300)}
 COORDINATE = "a coordinate in a scene, or an angle, which has either sign"
 NEGATIVE = {
     "--jobs": "-1 stands for one process a CPU",
+    "--explain.jobs": "-1 stands for one process a CPU",
     "--eye": COORDINATE,
     "--lights.ground": COORDINATE,
     "--start": COORDINATE,
     **{f"--{prefix}sensors.{name}-bias": COORDINATE
-       for prefix in ("", "environment.observation.", "stress.")
+       for prefix in ("", "environment.observation.", "stress.", "evaluate.")
        for name in ("position", "orientation")},
     "--limits.workspace": COORDINATE,
     "--reality.expert.grip-height": COORDINATE,
@@ -40,7 +41,7 @@ NEGATIVE = {
     "--environment.reward.engineered.hole": COORDINATE,
     "--environment.reward.engineered.seat": COORDINATE,
     **{f"--{prefix}.{name}": COORDINATE
-       for prefix in ("reality.task", "shapes")
+       for prefix in ("reality.task", "shapes", "evaluate.shapes")
        for name in ("block-position", "block-yaw", "box-position", "box-yaw")},
 }  # fmt: skip
 """Options of which -1 is accepted, and why."""

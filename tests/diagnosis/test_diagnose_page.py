@@ -50,6 +50,16 @@ def test_keys_of_lists_are_documented(found):
     assert set(re.findall(r"`(\w+)`", row)) == {"parameters", *parameter}
 
 
+def test_the_posterior_has_the_values_and_intervals_of_the_effects(found):
+    posterior, (accepted,) = found.to_json()["posterior"], found.accepted
+    (parameter,), ((variance,),) = posterior["parameters"], posterior["covariance"]
+    (fitted,) = accepted.parameters
+    assert (parameter["effect"], parameter["name"], parameter["value"]) == (accepted.name, fitted.name, fitted.value)
+    assert 1.96 * variance**0.5 * parameter["scale"] == pytest.approx(fitted.high - fitted.value, rel=1e-3)
+    row = next(line for line in PAGE.splitlines() if line.startswith("| `posterior` |"))
+    assert {"posterior", *posterior, *parameter} == set(re.findall(r"`(\w+)`", row))
+
+
 def test_every_verdict_is_explained():
     assert set(re.findall(r"^\| `(\w+)` \| ", PAGE.split("## Procedure")[0], re.MULTILINE)) == set(VERDICTS)
 

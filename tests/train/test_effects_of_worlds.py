@@ -13,6 +13,7 @@ from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.joints import JointDamping, Stribeck
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.effects.library.objects import Mass, Size
+from concent_warp.effects.posterior import JointPosterior
 from concent_warp.train.environment.randomisation import sample_model_fields
 from concent_warp.train.environment.world_effects import _sample_parameters, sample_world_effects
 from concent_warp.train.environment.worlds import _make_physics
@@ -62,6 +63,23 @@ def test_parameters_stay_within_their_bounds():
     assert values.min() >= 0
     assert values[:, 0].max() > 90
     assert len(np.unique(values[:, 0])) == 500
+
+
+def test_worlds_sample_what_was_fitted_together_from_its_joint_distribution():
+    scale, low, high = (10.0, 10.0, 0.1), (0.0, 0.0, 0.5), (np.inf, np.inf, 2.0)
+    covariance = ((1.0, 0.0, -0.95), (0.0, 0.0, 0.0), (-0.95, 0.0, 1.0))
+    posterior = JointPosterior(scale, covariance, low, high)
+    together = replace(DAMPING, posterior=posterior, first=0), replace(MASS, posterior=posterior, first=2)
+    damping, stribeck, mass = sample_world_effects(
+        task_of(together[0], STRIBECK, together[1]), 3000, 0, sample=True
+    ).values
+    assert np.corrcoef(damping[:, 0], mass[:, 0])[0, 1] == pytest.approx(-0.95, abs=0.02)
+    assert (damping[:, 0].std(), mass[:, 0].std()) == pytest.approx((10.0, 0.1), rel=0.06)
+    assert damping.min() >= 0
+    assert (damping[:, 1] == 20).all()
+    assert abs(np.corrcoef(stribeck[:, 0], mass[:, 0])[0, 1]) < 0.06
+    alone = sample_world_effects(task_of(together[1]), 3000, 0, sample=True).values[0]
+    assert (alone.mean(), alone.std()) == pytest.approx((1.2, 0.1), rel=0.06)
 
 
 def test_nothing_is_drawn_where_it_is_not_wanted_or_not_known(varied):

@@ -2,6 +2,8 @@
 
 A fit gives each parameter a 95 % interval. Worlds sample from the normal distribution with this interval, truncated at
 the parameter's bounds, so that the policy is trained for all plausible values and not only for the most likely one.
+Parameters that were fitted together have a joint normal distribution (`JointPosterior`): what the data determine only
+together, such as a sum of two frictions, varies as little as they say.
 """
 
 from __future__ import annotations
@@ -58,13 +60,14 @@ def sample_world_effects(
     m, effects = task.compiled, task.model.effects
     bare = task.model.spec(task.collidable).compile() if effects else m
     rng = np.random.default_rng([seed, 3])
+    together = _sample_together(bare, effects, worlds, seed) if sample else {}
     values, varied, fixed = [], [], []
-    for added in effects:
+    for k, added in enumerate(effects):
         rows = np.tile(added.array, (worlds, 1))
         if sample and _is_uncertain(added):
             if _can_vary(added.effect, added.effect.fields(m), variable):
                 parameters = added.effect.parameters(bare)
-                rows = _sample_parameters(parameters, added, worlds, rng)
+                rows = together[k] if k in together else _sample_parameters(parameters, added, worlds, rng)
                 varied.append(added.effect)
             elif _changes_motion(added.effect):
                 fixed.append(added.effect.name)
@@ -106,6 +109,31 @@ def _changes_motion(effect: Effect) -> bool:
 def _can_vary(effect: Effect, fields: tuple[str, ...], variable: Callable[[str], bool] | None) -> bool:
     """Return whether the parameters of an effect can differ between worlds of one compiled model."""
     return _changes_motion(effect) and not effect.edits and all(map(variable or bool, fields))
+
+
+def _sample_together(
+    bare: mujoco.MjModel, effects: tuple[AddedEffect, ...], worlds: int, seed: int
+) -> dict[int, np.ndarray]:
+    """Return sampled parameters of the effects that have a joint posterior, by their index, shape (worlds, P) each.
+
+    Those of the posterior whose effects the model lacks vary too, and are left out: the others have their marginal
+    distribution.
+    """
+    found: dict[int, np.ndarray] = {}
+    known = dict.fromkeys(a.posterior for a in effects if a.posterior is not None)
+    for number, posterior in enumerate(known):
+        mean, members = np.full(len(posterior.scale), np.nan), []
+        for k, added in enumerate(effects):
+            if added.posterior != posterior:
+                continue
+            part = slice(added.first, added.first + len(added.values))
+            mean[part] = added.array
+            members.append((k, part))
+        rows = posterior.sample(mean, worlds, np.random.default_rng([seed, 3, number]))
+        for k, part in members:
+            bounds = effects[k].effect.parameters(bare)
+            found[k] = np.clip(rows[:, part], [p.low for p in bounds], [p.high for p in bounds])
+    return found
 
 
 def _sample_parameters(

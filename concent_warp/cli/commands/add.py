@@ -32,7 +32,7 @@ class Arguments:
     """
 
     effect: tyro.conf.Positional[str] = ""
-    """Effect; --list shows all."""
+    """Effect; --list shows all. With --fit it may be left out: the effects that the model has are fitted again."""
     list: bool = False
     """List all effects with their parameters, and with --model where in it each may act."""
     model: Path | None = None
@@ -60,14 +60,20 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
     if arguments.list:
         _say_effects(None if arguments.model is None else Model.load(arguments.model))
         return None
-    for given, option in ((arguments.effect, "EFFECT"), (arguments.model, "--model"), (arguments.out, "--out")):
+    effect_or_fit = arguments.effect or arguments.fit
+    for given, option in ((effect_or_fit, "EFFECT"), (arguments.model, "--model"), (arguments.out, "--out")):
         if not given:
             raise ConcentError(f"{option} is missing", fix="see concent add --help, or --list for all effects")
     assert arguments.model is not None
     assert arguments.out is not None
     model = Model.load(arguments.model)
     _check_out(arguments.out, arguments.overwrite)
-    added = model.add_effect(arguments.effect, arguments.target, _assigned(arguments.set))
+    if arguments.effect:
+        added = model.add_effect(arguments.effect, arguments.target, _assigned(arguments.set))
+    elif arguments.target or arguments.set:
+        raise ConcentError("--target and --set are of an effect that is added", fix="name the effect")
+    else:
+        added = model
     fitted = None
     if arguments.fit is not None:
         from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects

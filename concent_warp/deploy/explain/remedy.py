@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from concent_warp.deploy.explain.result import Cause
+from concent_warp.deploy.setting_options import as_options
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import DEMONSTRATION, MODEL
+
+SETTINGS: Mapping[Cause, Mapping[str, Any]] = {
+    "perception": {
+        "environment.observation.sensors.position_std": 0.003,
+        "environment.observation.sensors.constant_share": 0.8,
+    },
+    "physics": {},
+    "policy": {"environment.reset.stuck.share": 0.4},
+    "unexplained": {
+        "environment.randomisation.friction": (0.3, 3.0),
+        "environment.randomisation.stiffness": (0.8, 1.2),
+    },
+}
+"""Settings of a training that mend a cause, by dotted name."""
 
 
 def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: Sequence[str]) -> tuple[str, ...]:
@@ -28,8 +44,7 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
             "# calibrate the camera again, with the robot in view, and track with it",
             "concent calibrate NEW_VIDEO.h5 -o calibrated.h5",
             "# until then: train for errors of this size",
-            f"concent train {demonstration} --model {model} --out runs/robust "
-            "--environment.observation.sensors.position-std 0.003 --environment.observation.sensors.constant-share 0.8",
+            f"concent train {demonstration} --model {model} --out runs/robust {as_options(SETTINGS[cause])}",
         )
     if cause == "physics":
         accepted = [] if diagnosis is None else [found.name.partition("(")[0] for found in diagnosis.accepted]
@@ -44,7 +59,7 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
         return (
             "# train on, or longer, with more starts from states without progress",
             f"concent train {demonstration} --model {model} --out runs/longer --ppo.iterations 600 "
-            "--environment.reset.stuck.share 0.4",
+            f"{as_options(SETTINGS[cause])}",
             "# if commands were at their limit: allow larger steps and leads",
             f"concent train {demonstration} --model {model} --out runs/stronger --environment.action.turn-lead 0.05",
         )
@@ -54,6 +69,5 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
         "# compare the model with them, channel by channel",
         f"concent compare {trials} --model {model}",
         "# train with more randomisation",
-        f"concent train {demonstration} --model {model} --out runs/wider --environment.randomisation.friction 0.3 3.0 "
-        "--environment.randomisation.stiffness 0.8 1.2",
+        f"concent train {demonstration} --model {model} --out runs/wider {as_options(SETTINGS[cause])}",
     )

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.result import Finding
-from concent_warp.fit.effects.cross_validation import block_sums, bootstrap_interval
-from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, clustered_std, formula_errors
+from concent_warp.fit.effects.cross_validation import Sums, block_sums, bootstrap_interval
+from concent_warp.fit.effects.intervals import (
+    NORMAL_QUANTILE,
+    FittedParameter,
+    clustered_std,
+    covariance,
+    formula_errors,
+    joint_posterior,
+)
+from concent_warp.fit.effects.prediction import Prediction
 
 
 def refit_jointly(last: FittedModel) -> FittedModel:
@@ -42,15 +50,12 @@ def joint_parameters(
     """
     prediction = last.prediction()
     sums = block_sums(last.pieces, last.blocks, last.limit)
-    std = clustered_std(sums, last.blocks, last.cfg.least_squares.prior)
-    nominal = np.zeros(len(std)) if nominal is None else nominal
+    errors = _errors(last, prediction, sums, widening, nominal)
     found = []
-    for k, part in enumerate(prediction.split):
+    for part in prediction.split:
         parameters, values = prediction.parameters[part], last.fit.values[part]
-        formula = formula_errors(last.model.effects[k].effect, parameters, values, last.cfg.discretisation_error)
-        factors = np.ones(len(parameters)) if widening is None or k not in widening else widening[k]
-        spread = np.hypot(std[part] * factors, nominal[part]) * [p.scale for p in parameters]
-        reaches = NORMAL_QUANTILE * np.hypot(spread, formula)
+        spread = np.hypot(errors.data[part], errors.nominal[part]) * [p.scale for p in parameters]
+        reaches = NORMAL_QUANTILE * np.hypot(spread, errors.formula[part])
         found.append(
             tuple(
                 FittedParameter.within(p, float(value), float(reach))
@@ -78,7 +83,56 @@ def joint_finding(
     return replace(finding, parameters=parameters, gain=share, low=low, high=high)
 
 
-def with_intervals(last: FittedModel, parameters: Sequence[tuple[FittedParameter, ...]]) -> FittedModel:
-    """Return a fitted model whose effects have the intervals of their parameters."""
-    intervals = [(p.low, p.high) for group in parameters for p in group]
-    return replace(last, model=last.prediction().model(last.fit.values, intervals))
+def with_intervals(
+    last: FittedModel,
+    parameters: Sequence[tuple[FittedParameter, ...]],
+    widening: Mapping[int, np.ndarray] | None = None,
+    nominal: np.ndarray | None = None,
+) -> FittedModel:
+    """Return a fitted model whose effects have the intervals of their parameters, and their joint posterior.
+
+    Args:
+        last: The fitted model.
+        parameters: What `joint_parameters` returned for it.
+        widening: As given to that.
+        nominal: As given to that.
+    """
+    prediction, fitted = last.prediction(), [p for group in parameters for p in group]
+    sums, prior = block_sums(last.pieces, last.blocks, last.limit), last.cfg.least_squares.prior
+    errors, scale = _errors(last, prediction, sums, widening, nominal), [p.scale for p in prediction.parameters]
+    independent = np.hypot(errors.nominal, errors.formula / scale)
+    covered = covariance(sums, last.blocks, prior)
+    posterior = joint_posterior(prediction.parameters, fitted, covered, errors.data, independent)
+    return replace(
+        last, model=prediction.model(last.fit.values, [(p.low, p.high) for p in fitted], posterior)
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Standard deviations of the parameters of a joint fit by their source, shape (P,) each."""
+
+    data: np.ndarray
+    """What the data leave, widened by the profile likelihood, in units of scale."""
+    nominal: np.ndarray
+    """Due to errors of nominal values, in units of scale."""
+    formula: np.ndarray
+    """Due to the form of the effects, in the units of the parameters."""
+
+
+def _errors(
+    last: FittedModel,
+    prediction: Prediction,
+    sums: Sums,
+    widening: Mapping[int, np.ndarray] | None,
+    nominal: np.ndarray | None,
+) -> _Errors:
+    """Return what leaves the parameters of a joint fit uncertain, see `joint_parameters`."""
+    data = clustered_std(sums, last.blocks, last.cfg.least_squares.prior)
+    formula = np.zeros(len(data))
+    for k, part in enumerate(prediction.split):
+        effect, values = last.model.effects[k].effect, last.fit.values[part]
+        formula[part] = formula_errors(effect, prediction.parameters[part], values, last.cfg.discretisation_error)
+        if widening is not None and k in widening:
+            data[part] = data[part] * widening[k]
+    return _Errors(data, np.zeros(len(data)) if nominal is None else nominal, formula)

@@ -196,7 +196,7 @@ class Revision:
                 final = joint_finding(f, parameters[owned + k], last, without, context.cfg.seed)
             record.update(f, final)
             reduced.append(without)
-        return [*fitted[:-1], with_intervals(last, parameters)], reduced, established
+        return [*fitted[:-1], with_intervals(last, parameters, widening, nominal)], reduced, established
 
     def remove_unestablished(
         self, fitted: list[FittedModel], without: Sequence[FittedModel | None], established: Sequence[bool]

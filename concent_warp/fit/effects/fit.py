@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from concent_warp.checks import Share, WindowLength, check_settings
+from concent_warp.effects.posterior import JointPosterior
 from concent_warp.errors import ModelError
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -20,6 +21,7 @@ from concent_warp.fit.effects.intervals import (
     clustered_std,
     covariance,
     formula_errors,
+    joint_posterior,
 )
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
@@ -156,13 +158,13 @@ def fit_effects(
     linear = projected(fit, robust)
     found = [window_linear.residual for window_linear in linear]
     report(1.0, "done")
-    parameters, correlation = _fitted_parameters(solver, fit, linear, windows, cfg)
+    parameters, correlation, posterior = _fitted_parameters(solver, fit, linear, windows, cfg)
     remarks = _remarks(solver, fit, parameters, correlation, cfg)
     before, after = noise_ratio(np.concatenate(given)), noise_ratio(np.concatenate(found))
     if robust_noise_ratio(found, robust) > max(robust_noise_ratio(given, robust), cfg.noise_ratio):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     fitted = FittedEffects(
-        solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
+        solver.p.model(fit.values, [(q.low, q.high) for q in parameters], posterior),
         tuple(tuple(parameters[part]) for part in solver.p.split),
         before,
         after,
@@ -232,8 +234,8 @@ def _best_start(
 
 def _fitted_parameters(
     solver: Solver, fit: Fit, linear: Sequence[Linear], windows: Sequence[Window], cfg: FitEffectsCfg
-) -> tuple[list[FittedParameter], np.ndarray]:
-    """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
+) -> tuple[list[FittedParameter], np.ndarray, JointPosterior]:
+    """Return the parameters with their 95 % intervals, P of them, the correlations of these (P, P), their posterior.
 
     The intervals combine the spread of the linear fit, see `clustered_std`, with `formula_errors`.
     """
@@ -248,7 +250,8 @@ def _fitted_parameters(
             formula[part] = formula_errors(
                 effect, solver.p.parameters[part], fit.values[part], cfg.discretisation_error
             )
-    reaches = NORMAL_QUANTILE * np.hypot(clustered_std(sums, blocks, settings.prior) * solver.scale, formula)
+    clustered = clustered_std(sums, blocks, settings.prior)
+    reaches = NORMAL_QUANTILE * np.hypot(clustered * solver.scale, formula)
     found = []
     for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)
@@ -258,7 +261,8 @@ def _fitted_parameters(
             high = q.null
         at_bound = value in (q.low, q.high) and q.null not in (value, high)
         found.append(FittedParameter(q.name, value, low, high, q.unit, q.null, at_bound))
-    return found, covered / np.outer(std, std)
+    posterior = joint_posterior(solver.p.parameters, found, covered, clustered, formula / solver.scale)
+    return found, covered / np.outer(std, std), posterior
 
 
 def _remarks(

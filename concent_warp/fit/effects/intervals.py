@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.posterior import JointPosterior
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg
 
@@ -62,6 +63,35 @@ def covariance(sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior)
     found = robust * np.outer(wider / spread, wider / spread)
     np.fill_diagonal(found, wider**2)  # also of parameters that nothing depends on, whose scores are all zero
     return found
+
+
+def joint_posterior(
+    parameters: Sequence[Parameter],
+    fitted: Sequence[FittedParameter],
+    covered: np.ndarray,
+    std: np.ndarray,
+    independent: np.ndarray,
+) -> JointPosterior:
+    """Return the posterior of P parameters that were fitted together.
+
+    Args:
+        parameters: The parameters.
+        fitted: Their values and intervals; those that are not finite get no variance.
+        covered: `covariance` of the fit, from which the correlations are taken, shape (P, P).
+        std: Standard deviations that the data leave, in units of the parameters' scale, shape (P,).
+        independent: Standard deviations from other sources, such as the form of an effect, likewise, shape (P,).
+    """
+    spread = np.sqrt(np.maximum(np.diag(covered), 1e-300))
+    known = np.array([np.isfinite([q.value, q.low, q.high]).all() for q in fitted], dtype=float)
+    own = std * known
+    found = covered / np.outer(spread, spread) * np.outer(own, own) + np.diag((independent * known) ** 2)
+    found = 0.5 * (found + found.T)
+    return JointPosterior(
+        tuple(float(p.scale) for p in parameters),
+        tuple(tuple(float(v) for v in row) for row in found),
+        tuple(float(p.low) for p in parameters),
+        tuple(float(p.high) for p in parameters),
+    )
 
 
 def clustered_std(sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior) -> np.ndarray:

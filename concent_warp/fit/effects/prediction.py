@@ -13,6 +13,7 @@ import numpy as np
 
 from concent_warp.checks import Bounds, Duration, Positive
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, variant_fields
+from concent_warp.effects.posterior import JointPosterior
 from concent_warp.effects.select import shown_dofs
 from concent_warp.simulate.engine import Engine, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -147,11 +148,18 @@ class Prediction:
         found.windows, found._kept = [self.windows[w] for w in windows], {}
         return found
 
-    def model(self, values: np.ndarray, intervals: Sequence[tuple[float, float]] = ()) -> Model:
-        """Return the model with all effects at some values, shape (P,), and their intervals."""
+    def model(
+        self,
+        values: np.ndarray,
+        intervals: Sequence[tuple[float, float]] = (),
+        posterior: JointPosterior | None = None,
+    ) -> Model:
+        """Return the model with all effects at some values, shape (P,), their intervals and their posterior."""
         added = []
         for e, part in zip(self.effects, self.split, strict=True):
-            added.append(AddedEffect(e, tuple(float(v) for v in values[part]), tuple(intervals[part])))
+            first = 0 if posterior is None else part.start
+            chosen = tuple(float(v) for v in values[part])
+            added.append(AddedEffect(e, chosen, tuple(intervals[part]), posterior, first))
         return replace(self._base, effects=tuple(added))
 
     def _engine(self, values: np.ndarray) -> tuple[Engine, mujoco.MjModel]:

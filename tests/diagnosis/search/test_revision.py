@@ -347,7 +347,7 @@ def test_effects_are_established_by_intervals_that_the_profile_likelihood_does_n
     monkeypatch.setattr(revision, "nominal_errors", lambda *_: "nominal")
     monkeypatch.setattr(revision, "refit_without_effect", lambda _, k: f"without {k}")
     monkeypatch.setattr(revision, "joint_finding", lambda f, parameters, *_: replace(f, parameters=parameters))
-    monkeypatch.setattr(revision, "with_intervals", lambda _, parameters: parameters)
+    monkeypatch.setattr(revision, "with_intervals", lambda _, parameters, *__: parameters)
     made.record.findings = [finding(name, 0.5, step=k) for k, name in enumerate("abcd")]
     made.record.widening = {k: f"width of {k}" for k in range(4)}
     found, without, established = made.revision._fitted_together(["given", "all"])

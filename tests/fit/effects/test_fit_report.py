@@ -68,7 +68,7 @@ def pieces(strength: tuple[float, ...], seed: int = 0) -> tuple[list[Linear], li
 def test_intervals_combine_the_covariance_and_the_discretisation_error():
     linear, windows = pieces((3.0, 5.0, 2.0))
     values = [4.0, -3.0, 1.5]
-    found, correlation = _fitted_parameters(solver_of(), fit_of(values), linear, windows, CFG)
+    found, correlation, posterior = _fitted_parameters(solver_of(), fit_of(values), linear, windows, CFG)
     blocks = cut_blocks(windows)
     sums = block_sums(linear, blocks, huber_limit([x.residual for x in linear]))
     covered, std = covariance(sums, blocks), clustered_std(sums, blocks)
@@ -80,12 +80,16 @@ def test_intervals_combine_the_covariance_and_the_discretisation_error():
         assert q.low == pytest.approx(max(values[k] - reach, p.low))
         assert q.high == pytest.approx(min(values[k] + reach, p.high))
         assert not q.at_bound
+        assert np.sqrt(posterior.matrix[k, k]) == pytest.approx(reach / NORMAL)
+    data = np.outer(std, std) * correlation
+    np.testing.assert_allclose(np.array(posterior.covariance)[0, 1:], data[0, 1:])
+    assert posterior.low == tuple(p.low for p in PARAMETERS)
 
 
 def test_an_effect_of_two_parameters_has_one_discretisation_error_and_one_of_none_has_none():
     linear, windows = pieces((1e6, 1e6, 1e6))
     solver = solver_of(split=[slice(0, 2), slice(2, 2), slice(2, 3)])
-    found, _ = _fitted_parameters(solver, fit_of([40.0, 0.1, 3.0]), linear, windows, CFG)
+    found, *_ = _fitted_parameters(solver, fit_of([40.0, 0.1, 3.0]), linear, windows, CFG)
     largest = 0.005 * 40.0
     assert found[0].high - found[0].value == pytest.approx(NORMAL * largest * 1.0, rel=1e-3)
     assert found[1].high - found[1].value == pytest.approx(NORMAL * largest * 0.5, rel=1e-3)
@@ -96,27 +100,27 @@ def test_an_interval_has_the_scatter_of_what_the_formula_leaves_out():
     linear, windows = pieces((1e6, 1e6, 1e6))
     solver = solver_of()
     solver.p.effects[0].formula_error = 0.03
-    found, _ = _fitted_parameters(solver, fit_of([40.0, 2.0, 3.0]), linear, windows, CFG)
+    found, *_ = _fitted_parameters(solver, fit_of([40.0, 2.0, 3.0]), linear, windows, CFG)
     assert found[0].high - found[0].value == pytest.approx(NORMAL * np.hypot(0.03, 0.005) * 40.0, rel=1e-3)
     assert found[1].high - found[1].value == pytest.approx(NORMAL * 0.005 * 2.0, rel=1e-3)
 
 
 def test_intervals_end_at_the_bounds_and_a_limit_that_is_hardly_determined_has_no_upper_end():
     linear, windows = pieces((1e-3, 1e-3, 1e-3))
-    found, _ = _fitted_parameters(solver_of(), fit_of([4.0, -3.0, 15.0]), linear, windows, CFG)
+    found, *_ = _fitted_parameters(solver_of(), fit_of([4.0, -3.0, 15.0]), linear, windows, CFG)
     width = 10.0 * NORMAL  # of the prior
     assert found[0].low == 0.0
     assert found[0].high == pytest.approx(4 + width, rel=0.01)
     assert found[1].low == pytest.approx(-3 - width / 2, rel=0.01)
     assert found[2].high == np.inf
     linear, windows = pieces((3.0, 3.0, 3.0))
-    found, _ = _fitted_parameters(solver_of(), fit_of([4.0, -3.0, 15.0]), linear, windows, CFG)
+    found, *_ = _fitted_parameters(solver_of(), fit_of([4.0, -3.0, 15.0]), linear, windows, CFG)
     assert found[2].high < 16.0
     narrow = (*PARAMETERS[:2], replace(PARAMETERS[2], high=15.1))
-    found, _ = _fitted_parameters(solver_of(narrow), fit_of([4.0, -3.0, 15.0]), linear, windows, CFG)
+    found, *_ = _fitted_parameters(solver_of(narrow), fit_of([4.0, -3.0, 15.0]), linear, windows, CFG)
     assert found[2].high == np.inf
     wide = FitEffectsCfg(undetermined_share=1e-4)
-    found, _ = _fitted_parameters(solver_of(), fit_of([4.0, -3.0, 15.0]), linear, windows, wide)
+    found, *_ = _fitted_parameters(solver_of(), fit_of([4.0, -3.0, 15.0]), linear, windows, wide)
     assert found[2].high == np.inf
     assert found[0].high < 5.0
 
@@ -134,7 +138,7 @@ def test_intervals_end_at_the_bounds_and_a_limit_that_is_hardly_determined_has_n
 def test_a_parameter_is_at_a_bound_unless_that_is_its_null_value(value, null, low, high, at_bound):
     linear, windows = pieces((3.0,))
     solver = solver_of((Parameter("a", "N", null, low, high, 1.0),))
-    ((found,), _) = _fitted_parameters(solver, fit_of([value]), linear, windows, CFG)
+    ((found,), *_) = _fitted_parameters(solver, fit_of([value]), linear, windows, CFG)
     assert found.at_bound is at_bound
     assert (found.value, found.low >= low, found.high <= high or np.isinf(null)) == (value, True, True)
 

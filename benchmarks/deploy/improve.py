@@ -1,0 +1,232 @@
+"""Success by round with a hidden effect, against training with the true effect, and against wide randomisation.
+
+python -m benchmarks.deploy.improve --jobs 5                       # goes on where the last run stopped
+python -m benchmarks.deploy.improve --names backlash=0.015         # some cases
+python -m benchmarks.deploy.improve --table                        # the page from the stored results
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import mean, median
+from typing import Any, Literal, get_args
+
+import torch
+import tyro
+
+from benchmarks.measurements import Measurements
+from benchmarks.pages import FOLDER, machine, machines, table, write_page
+from concent_warp.deploy.cfg import EvaluateCfg
+from concent_warp.deploy.evaluate import evaluate
+from concent_warp.deploy.explain.cfg import ExplainCfg
+from concent_warp.deploy.improve.cfg import ImproveCfg
+from concent_warp.deploy.improve.improve import improve
+from concent_warp.deploy.improve.steps import training_cfg
+from concent_warp.deploy.reality_world import reality_world
+from concent_warp.deploy.setting_options import with_settings
+from concent_warp.effects.registry import effect_class
+from concent_warp.model import Model
+from concent_warp.simulate.parallel import limit_simulations
+from concent_warp.train.policy.load import Policy, load_policy
+from concent_warp.train.train import train
+from concent_warp.train.trials.evaluate import wilson
+
+NAME = "improve"
+SEED = 600
+"""First seed; other ones were used for development."""
+TEST = 900_000
+"""Seed of the trials by which all arms are judged."""
+Arm = Literal["before", "rounds", "true effect", "randomised"]
+CASES = (
+    "joint_friction=4", "stribeck_friction=4", "joint_damping=30", "gravity_compensation=0.2", "actuator_delay=0.15",
+    "actuator_lag=0.2", "actuator_gain=0.2", "backlash=0.015",
+)  # fmt: skip
+"""Hidden effects, with the magnitude in the unit of their main parameter."""
+WIDE: Mapping[str, Any] = {
+    "environment.randomisation.friction": (0.3, 3.0), "environment.randomisation.stiffness": (0.7, 1.3),
+    "environment.randomisation.damping": (0.5, 4.0), "environment.randomisation.joint_friction": (0.0, 6.0),
+    "environment.randomisation.delay": (0.0, 0.2), "environment.randomisation.lag": (0.0, 0.25),
+}  # fmt: skip
+"""Wide randomisation, which includes most of the hidden effects."""
+BOUNDS = (0.4, 0.8)
+"""Success rates of the given policy for which a case counts."""
+INTRODUCTION = """\
+`python -m benchmarks.deploy.improve`: the insertion policy of the package in Reality, with an effect hidden in it that
+neither the model nor the policy knows. *Rounds* is `concent improve`: in each round failed trials are explained, the
+effect that is named is added to the model and fitted, and the policy is trained on. *True effect* trains on from the
+same policy, for as many iterations as all rounds together, in the model with the library's effect at its true values;
+*randomised* does so in the given model with wide randomisation of friction, drives, joint friction, delay and lag. All
+are judged in the same trials, which no arm has seen. A case counts where the given policy succeeds in 40 to 80 %.
+
+What the figures do not show: other tasks and robots, real ones among them; effects that the library lacks; two effects
+at once.
+"""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    names: tuple[str, ...] = CASES
+    """Hidden effects, name=value."""
+    seeds: int = 5
+    """Seeds of each."""
+    jobs: int = 1
+    """Arms at a time, a process each."""
+    policy: str = "shape_sorter"
+    """The policy to begin with."""
+    rounds: int = 3
+    iterations: int = 100
+    """Iterations of a round; the other arms have them of all rounds."""
+    worlds: int | None = None
+    """Parallel environments, those of the policy's training by default."""
+    episodes: int = 60
+    """Trials of a round."""
+    trials: int = 200
+    """Trials by which arms are judged."""
+    seconds: float | None = None
+    """Longest search for an effect [s]; by default as long as it takes."""
+    device: str | None = None
+    """Where policies are trained; the first CUDA device by default."""
+    out: Path = Path("runs/improve")
+    """Where rounds and policies are kept."""
+    data: Path = FOLDER / "data" / f"{NAME}.jsonl"
+    """Where results are kept."""
+    table: bool = False
+    """Only write the page from the results."""
+
+
+def main(args: Args) -> None:
+    """Measure what is not done yet, and write the page."""
+    kept = Measurements(args.data)
+    wanted = [(case, SEED + k, arm) for case in args.names for k in range(args.seeds) for arm in get_args(Arm)]
+    left = [one for one in ([] if args.table else wanted) if kept.wanted(key(*one))]
+    with ProcessPoolExecutor(max(1, min(args.jobs, len(left))), mp_context=get_context("spawn")) as pool:
+        tasks = {pool.submit(study, *one, args): key(*one) for one in left}
+        for task in as_completed(tasks):
+            try:
+                row = task.result()
+            except Exception as error:  # an arm that fails must not end the others
+                row = {"error": f"{type(error).__name__}: {error}"}
+            kept.add(tasks[task], {"machine": machine(args.device or "cpu"), **row})
+    rows = {name: row for name, row in kept.rows.items() if "error" not in row}
+    if rows and args.data == Args.data:
+        write_page(NAME, page(rows))
+
+
+def key(case: str, seed: int, arm: Arm) -> str:
+    """Return what a result is kept under."""
+    return f"{case} {seed} {arm}"
+
+
+def study(case: str, seed: int, arm: Arm, args: Args) -> dict[str, Any]:
+    """Return the success of one arm, in plain types."""
+    if args.jobs > 1:
+        torch.set_num_threads(1)
+    with limit_simulations(1 if args.jobs > 1 else None):
+        begun, given, hidden = time.perf_counter(), load_policy(args.policy), EvaluateCfg(hide=(case,))
+        row: dict[str, Any] = {"case": case, "seed": seed, "arm": arm}
+        folder = args.out / case / f"{seed}_{arm.replace(' ', '_')}"
+        policy = given
+        if arm == "rounds":
+            policy, more = _rounds(given, hidden, seed, folder, args)
+            row |= more
+        elif arm != "before":
+            policy = _trained(given, hidden, seed, arm, folder, args)
+        row["seconds"] = time.perf_counter() - begun
+        found = evaluate(policy, hidden, episodes=args.trials, seed=TEST + seed, device=args.device)
+    return row | {"successes": int(found.success.sum()), "trials": len(found.success)}
+
+
+def _rounds(policy: Policy, hidden: EvaluateCfg, seed: int, folder: Path, args: Args) -> tuple[Policy, dict[str, Any]]:
+    """Return the policy of the last round, and what the rounds found."""
+    jobs = 1 if args.jobs > 1 else -1
+    cfg = ImproveCfg(
+        rounds=args.rounds, target=1.0, episodes=args.episodes, iterations=args.iterations, worlds=args.worlds,
+        seed=1000 * seed, explain=ExplainCfg(seconds=args.seconds, jobs=jobs, seed=seed), evaluate=hidden,
+    )  # fmt: skip
+    found = improve(policy, policy.run.recording, cfg, world="reality", device=args.device, out=folder)
+    return load_policy(Path(found.policy)), {
+        "ending": found.ending,
+        "by round": [[one.successes, one.trials] for one in found.rounds],
+        "causes": [one.cause for one in found.rounds if one.cause],
+        "effects": [[effect.name for effect in one.effects] for one in found.rounds],
+    }
+
+
+def _trained(policy: Policy, hidden: EvaluateCfg, seed: int, arm: Arm, folder: Path, args: Args) -> Policy:
+    """Return the policy trained on in the model with the true effect, or with wide randomisation."""
+    cfg = ImproveCfg(iterations=args.rounds * args.iterations, worlds=args.worlds, seed=1000 * seed)
+    settings, run = training_cfg(cfg, policy.run.cfg, 1), policy.run
+    model = true_model(policy, hidden) if arm == "true effect" else run.model
+    if arm == "randomised":
+        settings = with_settings(settings, WIDE)
+    return train(
+        model,
+        run.recording,
+        settings,
+        events=run.events,
+        begin_with=policy,
+        device=args.device,
+        out=folder,
+        resume=True,
+    )
+
+
+def true_model(policy: Policy, hidden: EvaluateCfg) -> Model:
+    """Return a policy's model with the effects of the library at the true values of those that are hidden."""
+    run = policy.run
+    model = run.model
+    for one in reality_world(run.task(), run.cfg.environment, hidden).hidden():
+        model = model.add(effect_class(one.name)(*one.target), dict(one.truth))
+    return model
+
+
+def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the page."""
+    rates: dict[tuple[str, int], dict[str, float]] = {}
+    for row in rows.values():
+        rates.setdefault((row["case"], row["seed"]), {})[row["arm"]] = row["successes"] / row["trials"]
+    whole = {one: arms for one, arms in rates.items() if set(arms) == set(get_args(Arm))}
+    counted = {one: arms for one, arms in whole.items() if BOUNDS[0] <= arms["before"] <= BOUNDS[1]}
+    summary = []
+    for arm in get_args(Arm):
+        mine = [
+            (row["successes"], row["trials"])
+            for row in rows.values()
+            if row["arm"] == arm and (row["case"], row["seed"]) in counted
+        ]
+        successes, trials = (sum(column) for column in zip(*mine, strict=True)) if mine else (0, 0)
+        low, high = wilson(successes, trials)
+        shares = [arms[arm] / max(arms["true effect"], 1e-9) for arms in counted.values()]
+        of_true = f"{median(shares):.0%}, at least {min(shares):.0%}" if shares else "-"
+        summary.append([arm, f"{successes} of {trials}", f"{low:.0%} to {high:.0%}" if trials else "-", of_true])
+    head = ["arm", "succeed", "95 %", "share of *true effect*: median, smallest of a case and seed"]
+    detail = []
+    for case in dict.fromkeys(case for case, _ in rates):
+        seeds = [arms for (name, _), arms in rates.items() if name == case]
+        cells = [[arms[arm] for arms in seeds if arm in arms] for arm in get_args(Arm)]
+        by_round = [row["by round"] for row in rows.values() if row["case"] == case and "by round" in row]
+        named = [row["effects"] for row in rows.values() if row["case"] == case and "effects" in row]
+        right = sum(any(case.partition("=")[0] in effects for effects in found) for found in named)
+        detail.append(
+            [case, *(f"{mean(cell):.0%} ({min(cell):.0%} to {max(cell):.0%})" if cell else "-" for cell in cells),
+             "; ".join(" ".join(f"{s / n:.0%}" for s, n in one) for one in by_round), f"{right} of {len(named)}"]
+        )  # fmt: skip
+    columns = ["hidden effect", *get_args(Arm), "by round, a seed each", "effect named"]
+    counts = f"{len(counted)} of {len(whole)} cases and seeds count."
+    parts = [
+        "# Rounds of improvement", "Written by `benchmarks/deploy/improve.py`; do not edit.", INTRODUCTION,
+        machines(rows), "## Success", counts, table(head, summary), "## Cases",
+        "Mean over seeds, and the range of these.", table(columns, detail),
+    ]  # fmt: skip
+    return "\n\n".join(part.strip() for part in parts)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
