@@ -61,8 +61,8 @@ class Args:
     """Failed trials that are explained."""
     seed: int = SEED
     """Added to the number of a case, its seed."""
-    seconds: float | None = None
-    """Longest search for an effect [s]; by default as long as it takes."""
+    seconds: float | None = ExplainCfg().seconds
+    """Longest search for an effect [s]."""
     out: Path = Path("runs/explain")
     """Where recordings and trained policies are kept."""
     data: Path = FOLDER / "data" / f"{NAME}.jsonl"

@@ -12,11 +12,13 @@ import pytest
 import concent_warp as cw
 from concent_warp.deploy.explain.cfg import JudgeCfg, PoseBiasCfg
 from concent_warp.deploy.explain.evidence import Evidence, Judge
+from concent_warp.deploy.explain.explain import _Explaining
 from concent_warp.deploy.explain.misfit import divergence, misfit
 from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
 from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, fit_pose_bias
 from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
 from concent_warp.deploy.explain.replay_trial import ReplayedTrials
+from concent_warp.diagnosis.tasks import ignore_progress
 from concent_warp.recording.recording import Recording
 
 SHIFT = np.array([0.0, 0.0, -0.012, 0.0, 0.0, 0.0])
@@ -133,6 +135,38 @@ FAR = np.full(8, 7.0)
 )  # fmt: skip
 def test_the_cause_follows_from_the_evidence(policy: cw.Policy, changes: dict[str, Any], cause: str) -> None:
     assert Judge(policy, policy.run.task(), JudgeCfg()).cause(evidence(**changes)) == cause
+
+
+@pytest.mark.parametrize(
+    ("rate", "misfit_of_trials", "doubted"), [(0.0, 6.0, True), (0.0, 1.2, False), (1.0, 6.0, False)]
+)
+def test_starts_are_doubted_where_the_policy_fails_and_the_replays_contradict_them(
+    policy: cw.Policy, rate: float, misfit_of_trials: float, doubted: bool
+) -> None:
+    own = SimulatedTrials(np.full((8, 2), bool(rate)), Recording("", ()))
+    given = evidence(misfit=np.full(8, misfit_of_trials), own=own)
+    assert Judge(policy, policy.run.task(), JudgeCfg()).doubts_starts(given) == doubted
+
+
+def test_starts_are_corrected_by_an_error_that_leaves_little_more_than_noise(policy: cw.Policy) -> None:
+    judge = Judge(policy, policy.run.task(), JudgeCfg())
+    assert judge.corrects_starts(evidence(misfit=FAR, bias=bias(2.0)))
+    assert not judge.corrects_starts(evidence(misfit=FAR, bias=bias(6.0)))
+    assert not judge.corrects_starts(evidence(misfit=FAR))
+
+
+def test_free_motion_ends_before_the_object_comes_near_anything(
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
+) -> None:
+    trials = prepared[1]
+    given = Recording(policy.run.model.scene, tuple(t.demonstration for t in trials))
+    found = _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, None)._free_motion(trials)
+    judged = [t for t in trials if t.free_error is not None]
+    assert len(found.demonstrations) == len(judged) > 0
+    for part, trial in zip(found.demonstrations, judged, strict=True):
+        ends = [float(channel.time[-1]) for channel in part.measured.values()]
+        assert max(ends) <= trial.free_time < trial.readings.end
+        assert max(ends) > trial.free_time - 0.2
 
 
 def test_trials_that_all_succeeded_are_refused(

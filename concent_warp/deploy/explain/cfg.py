@@ -76,6 +76,9 @@ class JudgeCfg:
     """Share of the misfit above that of simulated trials that a cause must explain [-]."""
     weak_policy: Share = 0.7
     """Success rate in the policy's own simulation up to which the policy is the cause [-]."""
+    credible_start: Positive = 2.0
+    """Misfit up to which measured starts are credible [-]; noise alone leaves about 1. Where the policy fails in
+    simulation from starts with more, an error of the tracked poses is searched for first."""
     at_limit: Share = 0.95
     """Share of a limit of commands from which on it counts as reached [-]."""
 
@@ -101,13 +104,16 @@ class ExplainCfg:
     diagnose: bool = True
     """Whether the missing physical effect is searched for, which takes minutes."""
     diagnose_trials: Count = 2
-    """Failed trials that it is searched for in."""
+    """Failed trials that it is searched for in, where the joints do not differ in free motion."""
+    free_trials: Count = 8
+    """Trials, failed ones first, that it is searched for in up to their first contact, where the joints differ in free
+    motion: without contacts it is found in less time, and nothing else can be the reason."""
     effects: tuple[str, ...] = ()
     """Effects to consider; by default those of joints and drives where the joints differ in free motion, else all."""
     additions: Annotated[int, Bounds(1, 10)] = 1
     """Most missing effects that are named."""
-    seconds: PositiveDuration | None = None
-    """Time after which the search for an effect gives its best answer so far [s]; by default as long as it takes."""
+    seconds: PositiveDuration | None = 600.0
+    """Time after which the search for an effect gives its best answer so far [s]; None: as long as it takes."""
     jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time of that search; -1: one per CPU."""
     seed: int = 0

@@ -91,6 +91,18 @@ class Judge:
         found = mannwhitneyu(evidence.misfit, evidence.usual, alternative="greater")
         return larger and bool(found.pvalue <= self._cfg.significance)
 
+    def doubts_starts(self, evidence: Evidence) -> bool:
+        """Return whether the policy fails in its own simulation from starts that the replays contradict."""
+        weak = evidence.own.rate <= self._cfg.weak_policy
+        return weak and float(np.median(evidence.misfit)) > self._cfg.credible_start
+
+    def corrects_starts(self, evidence: Evidence) -> bool:
+        """Return whether an error of tracked poses explains the misfit of doubtful starts, above that of noise."""
+        if evidence.bias is None:
+            return False
+        excess = np.maximum(evidence.misfit - 1.0, 1e-9)
+        return bool(np.median((evidence.misfit - evidence.bias.after) / excess) >= self._cfg.explained)
+
     def moves_otherwise(self, evidence: Evidence) -> bool:
         """Return whether the robot's joints differ in free motion."""
         real, usual = (values[np.isfinite(values)] for values in (evidence.free, evidence.usual_free))

@@ -15,7 +15,7 @@ from concent_warp.deploy.explain.evidence import Evidence, Judge
 from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
 from concent_warp.deploy.explain.policy_evidence import other_action
-from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, fit_pose_bias
+from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, corrected, fit_pose_bias
 from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
 from concent_warp.deploy.explain.replay_trial import Replayer
 from concent_warp.deploy.explain.result import Explanation
@@ -27,6 +27,7 @@ from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ConcentError, ModelError, RecordingError, TrainError
 from concent_warp.files import write_json
 from concent_warp.model import Model
+from concent_warp.recording.cut import beginning
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.run_folder import make_folder
 from concent_warp.train.environment.observation import ObservationLayout
@@ -119,14 +120,15 @@ class _Explaining:
         progress(0.05, "asking the policy's own simulation")
         own = self._simulate([t.start for t in (*trials, *others)], 0.05, 0.2)
         progress(0.2, "replaying simulated trials")
-        step = max(1, len(own.recording.demonstrations) // cfg.simulated)
-        simulated = self._preparation.simulated(own.recording.demonstrations[::step])
-        evidence = self._measured(trials, others, simulated, own.of_first(len(trials)))
+        evidence = self._measured(trials, others, own)
         judge = Judge(self._policy, self._own.task, cfg.judge)
+        if judge.doubts_starts(evidence):
+            evidence = self._from_corrected_starts(evidence, judge, trials, others)
         if judge.differs(evidence):
-            evidence = self._with_bias(evidence)
+            if evidence.bias is None:
+                evidence = self._with_bias(evidence)
             if cfg.diagnose and not judge.is_perception(evidence):
-                evidence = self._with_diagnosis(evidence, judge)
+                evidence = self._with_diagnosis(evidence, judge, others)
             evidence = self._with_cause_in_simulation(evidence, judge)
         progress(1.0, "done")
         total = sum(len(r.demonstrations) for r in self._recordings)
@@ -141,16 +143,17 @@ class _Explaining:
         self,
         trials: list[PreparedTrial],
         others: list[PreparedTrial],
-        simulated: list[PreparedTrial],
         own: SimulatedTrials,
     ) -> Evidence:
-        """Return how far the replays of trials, and of simulated ones, are from what was measured."""
+        """Return how far the replays of trials, and of those of the own simulation, are from what was measured."""
+        step = max(1, len(own.recording.demonstrations) // self._cfg.simulated)
+        simulated = self._preparation.simulated(own.recording.demonstrations[::step])
         replayer, contact = self._preparation.replayer, self._preparation.contact
         scale = max(1.0, float(np.median([t.joint_error for t in simulated]))) if simulated else JOINT_SCALE
         width = self._cfg.judge.window
         return Evidence(
             trials=trials,
-            own=own,
+            own=own.of_first(len(trials)),
             joint_scale=scale,
             misfit=np.array([t.misfit(replayer, contact, scale) for t in trials]),
             usual=np.array([t.misfit(replayer, contact, scale) for t in simulated] or [1.0]),
@@ -187,11 +190,32 @@ class _Explaining:
         )
         return replace(evidence, bias=bias)
 
-    def _with_diagnosis(self, evidence: Evidence, judge: Judge) -> Evidence:
+    def _from_corrected_starts(
+        self, evidence: Evidence, judge: Judge, trials: list[PreparedTrial], others: list[PreparedTrial]
+    ) -> Evidence:
+        """Return the evidence with the own simulation from starts without an error of the tracked poses.
+
+        A policy that is shown in the hand what is not there fails in simulation as well, without being weak. Where no
+        error explains the misfit, the evidence stays.
+        """
+        evidence = self._with_bias(evidence)
+        bias = evidence.bias
+        assert bias is not None
+        if not judge.corrects_starts(evidence):
+            return replace(evidence, bias=None)
+        self._progress(0.45, "asking the policy's own simulation from corrected starts")
+        moved = [corrected(t.measured, self._preparation.contact.address, bias.value) for t in others]
+        found = self._measured(trials, others, self._simulate([*bias.starts, *moved], 0.45, 0.5))
+        return replace(found, bias=bias)
+
+    def _with_diagnosis(self, evidence: Evidence, judge: Judge, others: Sequence[PreparedTrial]) -> Evidence:
         """Search for a missing effect in failed trials, and see how much of all trials' misfit it explains."""
-        cfg = self._cfg
-        names = cfg.effects or (_robot_effects() if judge.moves_otherwise(evidence) else ())
-        recording = _joined(self._chosen[: cfg.diagnose_trials])
+        cfg, names = self._cfg, self._cfg.effects
+        if judge.moves_otherwise(evidence):
+            names = names or _robot_effects()
+            recording = self._free_motion([*evidence.trials, *others])
+        else:
+            recording = _joined([d for _, d in self._chosen[: cfg.diagnose_trials]], self._recordings[0])
         settings = DiagnoseCfg(
             effects=self._possible(names, recording), max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
             seed=cfg.seed, explain=False,
@@ -208,6 +232,13 @@ class _Explaining:
             contact, scale = self._preparation.contact, evidence.joint_scale
             explained = np.array([t.misfit(replayer, contact, scale) for t in evidence.trials])
         return replace(evidence, diagnosis=diagnosis, misfit_with_effect=explained)
+
+    def _free_motion(self, trials: Sequence[PreparedTrial]) -> Recording:
+        """Return trials up to where the object comes near anything but the hand."""
+        free = [t for t in trials if t.free_error is not None][: self._cfg.free_trials]
+        first = self._recordings[0]
+        parts = [beginning(_joined([t.demonstration], first), t.free_time).demonstrations[0] for t in free]
+        return _joined(parts, first)
 
     def _possible(self, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
         """Return those of some effects that could be missing in the model.
@@ -261,10 +292,10 @@ def _robot_effects() -> tuple[str, ...]:
     return tuple(n for n, kind in effect_classes().items() if kind.family == "joints" or n == "gravity_tilt")
 
 
-def _joined(trials: Sequence[tuple[Recording, Demonstration]]) -> Recording:
-    """Return one recording of trials from several ones, renumbered."""
-    demonstrations = tuple(replace(d, name=f"demo_{k}", policy=None) for k, (_, d) in enumerate(trials))
-    return Recording(trials[0][0].scene, demonstrations, source=trials[0][0].source)
+def _joined(trials: Sequence[Demonstration], first: Recording) -> Recording:
+    """Return one recording of trials from several ones, renumbered, in the scene of the first one."""
+    demonstrations = tuple(replace(d, name=f"demo_{k}", policy=None) for k, d in enumerate(trials))
+    return Recording(first.scene, demonstrations, source=first.source)
 
 
 def _added(policy: Policy, diagnosis: Diagnosis) -> Model:

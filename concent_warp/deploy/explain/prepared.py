@@ -35,6 +35,8 @@ class PreparedTrial:
     """RMS joint error of the replay over noise [-]."""
     free_error: float | None
     """The same in free motion; None where there is too little of it."""
+    free_time: float
+    """Time up to which the object came near nothing but the hand [s]."""
 
     def misfit(self, replayer: Replayer, contact: ContactStarts, joint_scale: float) -> float:
         """Return the misfit of the replay from its start; the move of the object counts as an error of the tracker."""
@@ -82,10 +84,10 @@ class Preparation:
         free = free_readings(
             self._scene, task.objects[0], task.robot.tool, demonstration, readings, start, cfg.judge.clearance
         )
-        judged = free > 1 and readings.time[free - 1] - readings.time[0] >= cfg.judge.least_free
-        return PreparedTrial(
-            demonstration, readings, measured, start, move, _rms(joints), _rms(joints[:free]) if judged else None
-        )
+        end = float(readings.time[max(free - 1, 0)])
+        judged = free > 1 and end - readings.time[0] >= cfg.judge.least_free
+        free_error = _rms(joints[:free]) if judged else None
+        return PreparedTrial(demonstration, readings, measured, start, move, _rms(joints), free_error, end)
 
     def simulated(self, demonstrations: Sequence[Demonstration]) -> list[PreparedTrial]:
         """Return simulated trials made ready, without those that ended at once."""
