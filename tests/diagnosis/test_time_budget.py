@@ -107,6 +107,7 @@ def test_the_answer_comes_at_any_time_and_says_what_is_open(recording, monkeypat
         for f in found.accepted:
             assert f.p <= CFG.significance_level
         if found.verdict != "unsettled":
+            assert found.remainder_searched == ("Open: whether another effect is missing." not in found.unsettled)
             assert [f.name for f in found.accepted] == [f.name for f in whole.accepted]
         else:
             assert found.unsettled
@@ -168,4 +169,4 @@ def test_many_names_are_counted():
 
 
 def test_shares_of_the_time_leave_some_for_the_end():
-    assert 0 < time_budget.SEARCH_SHARE < time_budget.TOGETHER_SHARE < 1
+    assert 0 < time_budget.SEARCH_SHARE < time_budget.PROFILE_SHARE < time_budget.TOGETHER_SHARE < 1
