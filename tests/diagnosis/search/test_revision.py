@@ -148,9 +148,9 @@ def test_profile_likelihoods_of_accepted_effects_are_evaluated_after_the_search(
             finding(name, 0.4, step=1),
             finding("c", 0.1, accepted=False, step=2),
         ]
-        fits = [SimpleNamespace(name="a", fit=first.fit, fall=1.0), SimpleNamespace(name=name, fit=fit, fall=fall)]
+        fits: Any = [SimpleNamespace(name="a", fit=first.fit, fall=1.0), SimpleNamespace(name=name, fit=fit, fall=fall)]
         made.record.unprofiled = {k: (f"base {n}", c) for k, (n, c) in enumerate(zip("ab", fits, strict=True))}
-        made.record.unprofiled[2] = "not accepted"
+        made.record.unprofiled[2] = ("base c", "not accepted")
         assert made.revision.profiled([first, last]) == [first, left]
         assert made.record.widening == widths
         shared = made.context.runner, made.context.cfg.profile
