@@ -82,9 +82,12 @@ class SearchCfg:
     """Noise ratio below which a fitted candidate leaves little to others [-]. Empirical."""
     noise_level_ratio: float = 1.03
     """Noise ratio below which a fit has reached the noise [-]: about one standard error of it over 1000 samples."""
+    decided_share: Share = 0.5
+    """Share of the first discrepancy that a fitted candidate leaves below which it leaves little to others, too [-]: no
+    candidate can take away more than there is, and what a weak one takes away besides shows in the next addition."""
     explained_min_gain: float = 0.3
-    """Expected gain over the best one below which a candidate is skipped after `explained_ratio` is reached [-].
-    Empirical."""
+    """Expected gain over the best one below which a candidate is skipped after `explained_ratio` or `decided_share` is
+    reached [-]. Empirical."""
     noise_level_min_gain: float = 0.5
     """The same after `noise_level_ratio` is reached [-]. Empirical."""
     restart_min_gain: float = 0.5
@@ -165,7 +168,8 @@ class ProfileLikelihoodCfg:
     state_iterations: int = 4
     """Iterations of the initial states at each point. Empirical."""
     min_cost_fall: float = 1.0
-    """Fall of the cost at a point that restarts the fit from there [cost]: log likelihood ratio 1."""
+    """Fall of the cost at a point that restarts the fit from there [cost]: log likelihood ratio 1, of residuals as
+    correlated as these are. It must also exceed the roughness of the cost."""
     max_restarts: int = 3
     """Most restarts. Empirical."""
     max_step_doublings: int = 4

@@ -96,7 +96,8 @@ class Procedure:
             fitted, detectable = self.search(given)
         revision = self.revision
         runner.enter(ADDITIONS_DONE, REVISION_DONE)
-        fitted = revision.final_values(revision.restore_given(revision.simplified(fitted), given))
+        fitted = revision.restore_given(revision.simplified(fitted), given)
+        fitted = revision.final_values(revision.profiled(fitted))
         found = self.conclude(given, fitted, detectable, issues)
         runner.progress(1.0, "done")
         return found
@@ -241,6 +242,7 @@ class Procedure:
             verdict = "group" if any(len(group) > 1 for group in record.groups) else "effect"
         explained = verdict == "none_needed" or not cfg.explain
         verdict = budget.verdict(verdict, [f.step for f in record.findings if f.accepted])
+        named = verdict in ("effect", "group")
         unsettled = "Left out: where the model fails, and the next experiment."
         where = budget.attempt(lambda: () if explained else self._failures(given), (), unsettled)
         experiment = budget.attempt(lambda: None if explained else self._suggested_experiment(), None, unsettled)
@@ -258,7 +260,8 @@ class Procedure:
             models=(given.model, *(one.delivered for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
-            form_error=form_error if verdict in ("effect", "group") else None,
+            form_error=form_error if named else None,
+            remainder_searched=not budget.cut if named else None,
             time_step=record.time_step,
             nominal_values=record.nominal_values,
             unsettled=tuple(budget.unsettled),

@@ -212,6 +212,9 @@ class Diagnosis:
     form_error: float | None = None
     """Share of the discrepancy that is left above the noise and taken for errors in the formulas of the accepted
     effects [-]; None where no more than noise is left, or something else is missing."""
+    remainder_searched: bool | None = None
+    """Whether the search for further effects beside the accepted ones came to its end; False where the time ended it,
+    so that something smaller may be missing too; None where the verdict is another one than "effect" or "group"."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
     nominal_values: tuple[FittedParameter, ...] = ()
@@ -254,6 +257,7 @@ class Diagnosis:
             "unexplained": self.unexplained,
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
             "form_error": self.form_error,
+            "remainder_searched": self.remainder_searched,
             "time_step": None if self.time_step is None else self.time_step.to_json(),
             "nominal_values": [_parameter(p) for p in self.nominal_values],
             "posterior": self._posterior(),
@@ -290,6 +294,18 @@ class Diagnosis:
             "covariance": row["covariance"],
         }  # fmt: skip
 
+    def _remainder_sentences(self) -> list[str]:
+        """Return what is said of a remainder beside the accepted effects: its size, and whether it was searched."""
+        said = []
+        if self.form_error is not None:
+            said.append(
+                f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no "
+                "more than errors in the formulas of the accepted effects."
+            )
+        if self.remainder_searched is False:
+            said.append("Whether something smaller is missing too was not settled in this time.")
+        return said
+
     def _repr_html_(self) -> str:
         """Return the verdict and the accepted effects as HTML, for notebooks."""
         headline = f"{self.headline[0].upper()}{self.headline[1:]}"
@@ -322,11 +338,7 @@ class Diagnosis:
             )
             if not self.explains and self.accepted:
                 said.append("The effects above explain too little to be added: the model stays as given.")
-        if self.form_error is not None:
-            said.append(
-                f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no "
-                "more than errors in the formulas of the accepted effects."
-            )
+        said += self._remainder_sentences()
         if self.unknown_force is not None:
             said.append(self.unknown_force.sentence)
         if self.next_experiment:

@@ -14,8 +14,9 @@ from concent_warp.simulate.time_limit import TimeUpError, stop_at
 
 T = TypeVar("T")
 
-SEARCH_SHARE, TOGETHER_SHARE = 0.8, 0.9
-"""Shares of the time after which the search for effects ends, and the fit of all that were accepted."""
+SEARCH_SHARE, PROFILE_SHARE, TOGETHER_SHARE = 0.75, 0.87, 0.93
+"""Shares of the time after which the search for effects ends, the profile likelihoods of those that were accepted, and
+the fit of all together."""
 
 
 class TimeBudget:

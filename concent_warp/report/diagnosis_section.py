@@ -67,6 +67,8 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
     left = f" {_share(diagnosis['unexplained'])} of the error stays unexplained." if "unexplained" in diagnosis else ""
     if (share := diagnosis.get("form_error")) is not None:
         left = f" What is left, {_share(share)} of the error, is no more than errors in the formulas of the effects."
+    if diagnosis.get("remainder_searched") is False:
+        left += " Whether something smaller is missing too was not settled in this time."
     if diagnosis["verdict"] == "none_needed":
         return "No discrepancy was detected: the model explains the measurements down to their noise."
     if diagnosis["verdict"] == "unsettled":

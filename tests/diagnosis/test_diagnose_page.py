@@ -10,6 +10,7 @@ import pytest
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import VERDICTS
+from concent_warp.diagnosis.time_budget import PROFILE_SHARE, SEARCH_SHARE
 from concent_warp.effects.library.nominal import BOUND, CLOCK_TOLERANCE, TOLERANCE
 from tests.scenes.swinging import drawing, swung
 
@@ -93,6 +94,12 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     assert f"multiple shooting over windows of {cfg.search.shooting_window:g} s" in PAGE
     assert f"shortened to their first {cfg.search.shooting_window:g} s" in PAGE
     assert f"the first fits leave more than {cfg.search.explained_ratio:g} x noise, all" in PAGE
+    quiet = 1 / np.sqrt(1 - cfg.quiet_min_gain)
+    assert f"than an effect must remove (8): beside effects, up to {quiet:.2f} x noise" in PAGE
+    assert (cfg.search.decided_share, cfg.search.explained_min_gain) == (0.5, 0.3)
+    assert "leaves less than half of the discrepancy, those\n   that promise less than three tenths of its gain" in PAGE
+    assert (SEARCH_SHARE, PROFILE_SHARE) == (0.75, 0.87)
+    assert "Three quarters of the time are for the search, an eighth for intervals" in PAGE
     assert (cfg.search.shooting_fits, cfg.search.shooting_min_gain) == (3, 0.5)
     assert f"continued as the windows grow by factors of {cfg.search.window_growth:g}" in PAGE
     assert (cfg.search.scan_step, cfg.search.polish_min_gain) == (0.25, 0.7)

@@ -102,13 +102,26 @@ def test_what_is_left_and_taken_for_errors_in_formulas_is_named_with_its_size():
     assert with_form.headline == VERDICTS["effect"]
 
 
+def test_a_remainder_that_was_not_searched_is_said_to_be_open():
+    named = diagnosis(form_error=0.0287, ratio=(5.0, 1.3), unexplained=0.0287, remainder_searched=False)
+    said = named.sentences()
+    assert said[said.index("Whether something smaller is missing too was not settled in this time.") - 1].startswith(
+        "What is left, 1.30 x noise, is 2.9 % of the discrepancy"
+    )
+    assert named.to_json()["remainder_searched"] is False
+    for searched in (True, None):
+        other = replace(named, remainder_searched=searched)
+        assert not any("smaller" in s for s in other.sentences())
+        assert other.to_json()["remainder_searched"] is searched
+
+
 def test_json_has_the_share_of_errors_in_formulas_and_null_where_there_is_none():
     document = json.loads(json.dumps(diagnosis(form_error=0.0287).to_json(), allow_nan=False))
     assert document["form_error"] == 0.0287
     found = diagnosis().to_json()
     assert found["form_error"] is None
     keys = list(found)
-    assert keys.index("form_error") == keys.index("unknown_force") + 1 == keys.index("time_step") - 1
+    assert keys.index("form_error") == keys.index("unknown_force") + 1 == keys.index("time_step") - 2
 
 
 def test_nominal_values_are_told_as_factors_and_latencies_with_their_unit():

@@ -19,7 +19,8 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         ((3.0, 2.0, 1.5, 1.4), 9, 4, None),
         ((3.0, 2.0), 1, 2, None),
         ((1.27, 1.0246), 9, 2, None),
-        ((1.27, 1.0248, 1.0), 9, 3, None),
+        ((1.27, 1.0248, 1.0), 9, 2, None),  # more than noise, but less than a further effect must remove
+        ((1.27, 1.07, 1.0), 9, 3, None),
         ((3.0, 1.24, 1.0), 9, 3, 1),  # adequate, but 7 % of the discrepancy is left: one more is tried
         ((2.4, 1.24, 1.0), 9, 3, None),
         ((5.0, 1.26, 1.0), 9, 3, 1),

@@ -21,6 +21,7 @@ from concent_warp.simulate import time_limit
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.time_limit import TimeUpError, deadline, stop_at
+from tests.diagnosis.search.test_unknown_force_search import FRICTION, bump, rail, ridden
 from tests.scenes.swinging import drawing, swung
 
 CFG = DiagnoseCfg(jobs=1, explain=False, effects=("joint_damping", "joint_friction", "armature"))
@@ -107,6 +108,7 @@ def test_the_answer_comes_at_any_time_and_says_what_is_open(recording, monkeypat
         for f in found.accepted:
             assert f.p <= CFG.significance_level
         if found.verdict != "unsettled":
+            assert found.remainder_searched == ("Open: whether another effect is missing." not in found.unsettled)
             assert [f.name for f in found.accepted] == [f.name for f in whole.accepted]
         else:
             assert found.unsettled
@@ -119,6 +121,30 @@ def test_the_answer_comes_at_any_time_and_says_what_is_open(recording, monkeypat
     assert sentences[-1] == ()
     assert any("Open: whether any effect is missing." in said for said in sentences)
     assert any("Not fitted" in s for said in sentences for s in said)
+
+
+def test_an_effect_that_leaves_an_error_of_form_is_the_answer_where_the_time_ends_during_the_search_after_it(
+    monkeypatch,
+):
+    recording = ridden(friction=FRICTION, force=bump)
+    model = Model(Scene(rail()))
+    found = {}
+    for looks in (140, 220, 400):
+        with monkeypatch.context() as patch:
+            Clock(patch)
+            found[looks] = diagnose(model, recording, replace(CFG, seconds=looks))
+    assert [(f.verdict, f.remainder_searched) for f in found.values()] == [
+        ("unsettled", None),  # before the effect was fitted
+        ("effect", False),
+        ("effect", True),
+    ]
+    said = found[220].sentences()
+    assert any(s.startswith("What is left, 1.15 x noise, is 1.2 % of the discrepancy") for s in said)
+    assert "Whether something smaller is missing too was not settled in this time." in said
+    assert "Open: whether another effect is missing." in found[220].unsettled
+    assert found[400].unsettled == ()
+    for name in ("verdict", "groups", "form_error"):
+        assert found[220].to_json()[name] == found[400].to_json()[name]
 
 
 def test_parts_that_were_not_finished_are_not_kept(recording, monkeypatch, tmp_path):
@@ -168,4 +194,4 @@ def test_many_names_are_counted():
 
 
 def test_shares_of_the_time_leave_some_for_the_end():
-    assert 0 < time_budget.SEARCH_SHARE < time_budget.TOGETHER_SHARE < 1
+    assert 0 < time_budget.SEARCH_SHARE < time_budget.PROFILE_SHARE < time_budget.TOGETHER_SHARE < 1

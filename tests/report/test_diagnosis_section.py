@@ -55,6 +55,13 @@ def test_what_formulas_leave_is_named_as_their_error():
     assert "stays unexplained" not in text
 
 
+def test_a_remainder_that_was_not_searched_is_said_to_be_open():
+    sentence = "Whether something smaller is missing too was not settled in this time."
+    text = words_of(diagnosis_section({**NAMED, "form_error": 0.043, "remainder_searched": False}))
+    assert f"errors in the formulas of the effects. {sentence}" in text
+    assert sentence not in words_of(diagnosis_section({**NAMED, "remainder_searched": True}))
+
+
 def test_several_accepted_effects_are_all_named():
     both = {**NAMED, "effects": [effect("joint_friction", 0.4, 0.005), effect("load_friction", 0.3, 0.01)]}
     text = _headline(both)

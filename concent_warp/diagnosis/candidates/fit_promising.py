@@ -39,8 +39,10 @@ class CandidateFits:
         """The same as they were screened."""
         self.left: list[ScreenedCandidate] = []
         """Candidates that there was no time to fit."""
-        self.unrefined: list[Effect] = []
-        """Effects whose fits there was no time to refine."""
+        self.unrefined: list[int] = []
+        """Indices of the fits that there was no time to refine."""
+        self.started_from: set[tuple[int, int]] = set()
+        """Indices of fits that were restarted, each with that of the best one from whose initial states."""
         self.restarted: set[tuple[int, float, float]] = set()
         """Fits that have been restarted from the best, by index and both costs: again it would be the same."""
 
@@ -101,11 +103,18 @@ class CandidateFits:
         if self.left:
             names = [f"{name(s.effect)} (expected to remove {100 * s.expected_gain:.0f} %)" for s in self.left]
             found.append((f"Not fitted: {in_words(names)}.", True))
-        best = None if not self.fits else self._best().effect
-        if rivals := [name(effect) for effect in self.unrefined if effect is not best]:
-            found.append((f"Fits not refined, which may explain as much as the best: {in_words(rivals)}.", True))
-        if best is not None and best in self.unrefined:
-            found.append((f"Fit not refined: {name(best)}.", False))
+        if not self.unrefined:
+            return found
+        best = self.fits.index(self._best())
+        # From the initial states of the best one a rival explains what it can beside it: others would change both.
+        rivals = [k for k in self.unrefined if k != best and (k, best) not in self.started_from]
+        others = [k for k in self.unrefined if k not in rivals]
+        for chosen, lead, decides in (
+            (rivals, "Fits not refined, which may explain as much as the best", True),
+            (others, "Fits not refined" if len(others) > 1 else "Fit not refined", False),
+        ):
+            if chosen:
+                found.append((f"{lead}: {in_words([name(self.fits[k].effect) for k in chosen])}.", decides))
         return found
 
     def refit_rivals(self, expected: np.ndarray) -> None:
@@ -125,7 +134,7 @@ class CandidateFits:
             pairs = {k: (k, self.fits[k].fit.cost, best.fit.cost) for k in close}
             anew = [k for k in close if pairs[k] not in self.restarted]
             self.restarted |= {pairs[k] for k in anew}
-            self._refit(anew, restart_candidate, "fitting rivals again", best.fit, search)
+            self._restart(anew, best)
             near = [k for k in close if self.fits[k].share(base) > least]
             if any(self.fits[k].errors.sum() > (1 + search.equal_error) * best.errors.sum() for k in near):
                 self._refit([*near, k_best], polish_candidate, "refining initial states", search)
@@ -145,17 +154,28 @@ class CandidateFits:
         """Return the share of the baseline's squared residual beyond the noise that the best fit leaves [-]."""
         return (self._best().ratio ** 2 - 1) / max(self.base.ratio**2 - 1, 1e-9)
 
-    def _refit(self, chosen: Sequence[int], task: Callable[..., FittedCandidate], text: str, *settings: Any) -> None:
-        """Replace some fits by what a task makes of each."""
-        tasks = [(self.base, self.fits[k], *settings) for k in chosen]
+    def _refit(
+        self, chosen: Sequence[int], task: Callable[..., FittedCandidate], text: str, *settings: Any
+    ) -> list[int]:
+        """Replace some fits by what a task makes of each; returns those that there was time for."""
+        tasks, done = [(self.base, self.fits[k], *settings) for k in chosen], []
         for k, c in zip(chosen, self.runner.run_in_time(task, tasks, text), strict=True):
             if c is not None:
                 self.fits[k] = c
-            elif self.fits[k].effect not in self.unrefined:
-                self.unrefined.append(self.fits[k].effect)
+                done.append(k)
+            elif k not in self.unrefined:
+                self.unrefined.append(k)
+        return done
+
+    def _restart(self, chosen: Sequence[int], best: FittedCandidate, *, quick: bool = False) -> None:
+        """Restart some fits from the initial states of the best, see `restart_candidate`."""
+        place = self.fits.index(best)
+        settings = (best.fit, self.search, True) if quick else (best.fit, self.search)
+        done = self._refit(chosen, restart_candidate, "fitting rivals again", *settings)
+        self.started_from |= {(k, place) for k in done}
 
     def _fit_in_batches(self, promising: Sequence[ScreenedCandidate]) -> list[ScreenedCandidate]:
-        """Fit candidates, a few at a time; once one explains the data, only those that promise enough beside it.
+        """Fit candidates, a few at a time; once one explains most, only those that promise enough beside it.
 
         Returns those that were fitted.
         """
@@ -173,7 +193,7 @@ class CandidateFits:
             if not self.fits:
                 continue
             least = min(c.ratio for c in self.fits)
-            if least < search.explained_ratio or self._left() < self.cfg.unknown_force.min_share:
+            if least < search.explained_ratio or self._left() < search.decided_share:
                 best = max(c.share(base) for c in self.fits)
                 at_noise = least < search.noise_level_ratio
                 needed = search.noise_level_min_gain if at_noise else search.explained_min_gain
@@ -203,7 +223,7 @@ class CandidateFits:
             share * best.share(self.base) for share in (self.search.restart_min_gain, self.search.polish_min_gain)
         )
         lagging = [k for k in range(len(self.fits)) if low < expected[k] <= high]
-        self._refit(lagging, restart_candidate, "fitting rivals again", best.fit, self.search, True)
+        self._restart(lagging, best, quick=True)
         for k in lagging:
             expected[k] = max(expected[k], self.fits[k].share(self.base))
 
@@ -223,7 +243,7 @@ class CandidateFits:
             and c.share(self.base) <= search.close_min_gain * gain
             and (c.share(self.base) > search.explained_min_gain * gain or _are_confused(c.effect, best.effect))
         ]
-        self._refit(behind, restart_candidate, "fitting rivals again", best.fit, search, True)
+        self._restart(behind, best, quick=True)
         return any(self.fits[k].share(self.base) > search.polish_min_gain * gain for k in behind)
 
     def _polish_near(self, best: FittedCandidate, expected: np.ndarray) -> None:
@@ -271,12 +291,11 @@ class CandidateFits:
         least = max(self.cfg.min_gain, search.shooting_min_gain * ranked[0][0]) if ranked else 0.0
         chosen = [(s, c) for share, s, c in ranked if share > least][: search.shooting_fits]
         tasks = [(base, c, search) for _, c in chosen]
-        added, effects = 0, [c.effect for c in self.fits]
+        added, places = 0, {id(s): k for k, s in enumerate(self.fitted)}  # fits from other processes have copies
         for (s, _), c in zip(chosen, self.runner.run_in_time(continue_fit, tasks, "growing windows"), strict=True):
             if c is None:
                 continue
-            if s.effect in effects:
-                k = effects.index(s.effect)
+            if (k := places.get(id(s))) is not None:
                 self.fits[k] = min(self.fits[k], c, key=lambda one: one.fit.cost)
             else:
                 self.fits.append(c)

@@ -25,9 +25,9 @@ def group_indistinguishable(
 ) -> list[tuple[FittedCandidate, Finding]]:
     """Return the accepted candidates that cannot be distinguished from the best, the most plausible first.
 
-    The first one is polished and its parameters get a profile likelihood. Where more candidates are nearly equal,
-    theirs are evaluated too, which lowers their costs and measures their roughness; over many windows the latter shows
-    in the differences of their errors anyway.
+    The first one is polished. Where more candidates are nearly equal, the profile likelihoods of their parameters are
+    evaluated, which lowers their costs and measures their roughness; over many windows the latter shows in the
+    differences of their errors anyway. What the intervals alone need a profile for comes after the search.
 
     Args:
         base: The fitted baseline.
@@ -40,7 +40,7 @@ def group_indistinguishable(
     search, budget = cfg.search, budget or TimeBudget(None)
 
     def profiled(c: FittedCandidate) -> FittedCandidate:
-        unsettled = f"Interval of {c.effect.name} from the linear fit, not from its profile likelihood."
+        unsettled = f"Left out of the comparison: the profile likelihood of {c.effect.name}."
         return budget.attempt(lambda: refine_by_profile(base, c, runner, cfg.profile), c, unsettled)
 
     def with_evidence(c: FittedCandidate) -> tuple[FittedCandidate, Finding]:
@@ -58,7 +58,5 @@ def group_indistinguishable(
     best = group[0][0]
     unsettled = f"Fit not refined: {best.effect.name}."
     best = budget.attempt(lambda: polish_candidate(base, best, search, thorough=True), best, unsettled)
-    # A profile from where another one ended, and a polish found nothing, would be the same.
-    same = best.std is not None and best.fit.cost == group[0][0].fit.cost
-    group[0] = with_evidence(best if same else profiled(best))
+    group[0] = with_evidence(best)
     return group

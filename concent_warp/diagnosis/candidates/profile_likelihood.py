@@ -3,9 +3,11 @@
 Contacts make the cost rough, so that derivatives at a point neither lead to its minimum nor give its width. The cost is
 therefore evaluated some standard deviations away along the profile of each parameter: the other parameters at their
 conditional optimum to first order, the initial states fitted again (Bates and Watts, Nonlinear Regression Analysis and
-Its Applications, 1988, chapter 6). A point with a lower cost restarts the fit. Where the cost rises by less than its
-roughness, points farther away follow. In the end a parabola through the farthest points gives the width, the offset of
-the minimum, and the variance that the roughness adds.
+Its Applications, 1988, chapter 6). A point with a lower cost restarts the fit. Residuals that are correlated make costs
+differ by more than independent ones do: falls are judged in units of this overdispersion, as quasi-likelihoods are
+(McCullagh and Nelder, Generalized Linear Models, 1989, chapter 9). Where the cost rises by less than its roughness,
+points farther away follow. In the end a parabola through the farthest points gives the width, the offset of the
+minimum, and the variance that the roughness adds.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from concent_warp.diagnosis.candidates.fit_candidate import candidate_solver, fi
 from concent_warp.diagnosis.cfg import ProfileLikelihoodCfg
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.intervals import covariance
+from concent_warp.simulate.time_limit import TimeUpError
 
 
 @dataclass(frozen=True)
@@ -40,26 +43,49 @@ class ProfilePoint:
     expected_rise: float
     """Rise of a quadratic cost."""
 
+    @property
+    def overdispersion(self) -> float:
+        """Variance of the parameter over that which independent residuals leave, 1 at least [-].
+
+        With these a quadratic cost rises by half the squared distance [standard deviations].
+        """
+        return max(2 * self.expected_rise / self.distance**2, 1.0)
+
 
 def refine_by_profile(
-    base: FittedModel, c: FittedCandidate, runner: TaskRunner, cfg: ProfileLikelihoodCfg | None = None
+    base: FittedModel,
+    c: FittedCandidate,
+    runner: TaskRunner,
+    cfg: ProfileLikelihoodCfg | None = None,
+    *,
+    restarts: bool = True,
 ) -> FittedCandidate:
     """Return a candidate at a minimum of its profile likelihood, with standard deviations and roughness.
+
+    Where the time does not suffice for all of it, they are those of the points that there are.
 
     Args:
         base: The baseline that it was added to.
         c: The candidate.
         runner: Runs the evaluations.
         cfg: Settings.
+        restarts: Whether a lower cost restarts the fit; else it stays as it is.
+
+    Raises:
+        TimeUpError: There was no time for the first points.
     """
     cfg = cfg or ProfileLikelihoodCfg()
-    for _ in range(cfg.max_restarts):
-        points = _profile(base, c, runner, cfg, cfg.min_cost_fall)
-        best = min(points, key=lambda s: s.cost, default=None)
-        if best is None or best.cost > c.fit.cost - cfg.min_cost_fall:
-            return _with_spread(base, c, points, cfg)
-        c = _restarted(base, c, _line_search(base, c, best, cfg))
-    return _with_spread(base, c, _profile(base, c, runner, cfg, float("inf")), cfg)
+    left = cfg.max_restarts if restarts else 0
+    points = _profile(base, c, runner, cfg, restarts=left > 0)
+    while left and (best := _lower(c, points, cfg)) is not None:
+        left -= 1
+        try:
+            found = _restarted(base, c, _line_search(base, c, best, cfg))
+            points = _profile(base, found, runner, cfg, restarts=left > 0)
+        except TimeUpError:
+            break
+        c = found
+    return _with_spread(base, c, points, cfg)
 
 
 def profile_point(
@@ -84,19 +110,34 @@ def profile_point(
 
 
 def _profile(
-    base: FittedModel, c: FittedCandidate, runner: TaskRunner, cfg: ProfileLikelihoodCfg, min_cost_fall: float
+    base: FittedModel, c: FittedCandidate, runner: TaskRunner, cfg: ProfileLikelihoodCfg, *, restarts: bool
 ) -> list[ProfilePoint]:
-    """Return points on the profile of each parameter, farther away where needed, until one has a lower cost."""
+    """Return points on the profile of each parameter, farther away where needed, until a lower one restarts the fit."""
     points: list[ProfilePoint] = []
     for _ in range(1 + cfg.max_extensions):
         distances = _next_distances(base, c, points, cfg)
         if not distances:
             break
         tasks = [(base, c, *each, cfg) for each in distances]
-        points += runner.run(profile_point, tasks, "profile likelihood")
-        if min(s.cost for s in points) < c.fit.cost - min_cost_fall:
+        found = runner.run_in_time(profile_point, tasks, "profile likelihood")
+        finished = [s for s in found if s is not None]
+        if not points and len(finished) < len(found):
+            raise TimeUpError("the profile likelihood was not evaluated on both sides in the time given")
+        points += finished
+        if len(finished) < len(found) or (restarts and _lower(c, points, cfg) is not None):
             break
     return points
+
+
+def _lower(c: FittedCandidate, points: Sequence[ProfilePoint], cfg: ProfileLikelihoodCfg) -> ProfilePoint | None:
+    """Return the point with the lowest cost, None where none is below the fit's by more than they may differ.
+
+    They differ by the overdispersion, and by the roughness of the cost: of several points about a fit one is lower by
+    as much, and intervals contain that.
+    """
+    rough = _largest_roughness(c, points, cfg)
+    lower = [s for s in points if c.fit.cost - s.cost >= max(cfg.min_cost_fall * s.overdispersion, rough)]
+    return min(lower, key=lambda s: s.cost, default=None)
 
 
 def _next_distances(
@@ -104,21 +145,30 @@ def _next_distances(
 ) -> list[tuple[int, float]]:
     """Return the points to evaluate next: parameter of the candidate, and signed distance [standard deviations].
 
-    Both sides of each parameter at first; then farther on the sides where the cost has not risen enough.
+    Both sides of each parameter at first; then farther on the sides where the cost has not risen enough, at once so far
+    that a quadratic cost with the roughness would have.
     """
+    rungs = [cfg.first_step * cfg.step_growth**k for k in range(1 + cfg.max_extensions)]
     prediction = base.prediction(c.effect)
     std = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior)))
     found = []
     for k in range(prediction.owned, len(prediction.parameters)):
         p, value = prediction.parameters[k], c.fit.values[k]
-        needed = max(cfg.min_rise_over_roughness * _roughness(c, points, k, cfg), cfg.min_rise)
+        rough = _roughness(c, points, k, cfg)
+        needed = max(cfg.min_rise_over_roughness * rough, cfg.min_rise)
         for side in (-1.0, 1.0):
             farthest = _farthest(points, k, side)
             if farthest is not None and farthest.cost - c.fit.cost >= needed:
                 continue
-            distance = side * cfg.first_step if farthest is None else cfg.step_growth * farthest.distance
-            if np.isfinite(value) and p.low <= value + distance * std[k] * p.scale <= p.high:
-                found.append((k, distance))
+            reached = 0.0 if farthest is None else abs(farthest.distance)
+            curvature = np.inf if farthest is None else farthest.expected_rise / farthest.distance**2
+            within = [
+                d
+                for d in rungs
+                if d > reached and np.isfinite(value) and p.low <= value + side * d * std[k] * p.scale <= p.high
+            ]
+            if within:
+                found.append((k, side * next((d for d in within if curvature * d**2 + rough >= needed), within[-1])))
     return found
 
 
@@ -149,8 +199,13 @@ def _with_spread(
     base: FittedModel, c: FittedCandidate, points: Sequence[ProfilePoint], cfg: ProfileLikelihoodCfg
 ) -> FittedCandidate:
     """Return a candidate with the standard deviations and the roughness that its profile gives."""
-    rough = max((_roughness(c, points, s.parameter, cfg) for s in points), default=0.0)
+    rough = _largest_roughness(c, points, cfg)
     return replace(c, std=_standard_deviations(base, c, points, cfg), cost_roughness=rough)
+
+
+def _largest_roughness(c: FittedCandidate, points: Sequence[ProfilePoint], cfg: ProfileLikelihoodCfg) -> float:
+    """Return the largest roughness of any parameter, see `_roughness`."""
+    return max((_roughness(c, points, k, cfg) for k in {s.parameter for s in points}), default=0.0)
 
 
 def _roughness(c: FittedCandidate, points: Sequence[ProfilePoint], parameter: int, cfg: ProfileLikelihoodCfg) -> float:

@@ -15,7 +15,7 @@ from concent_warp.diagnosis.candidates.baseline import add_candidate
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.candidates.evidence import leaves_more
 from concent_warp.diagnosis.result import Detectable
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
@@ -72,6 +72,11 @@ class Additions:
                 continue
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
+            if step and self._is_futile(fitted[-1]):
+                if finer is None:
+                    break
+                fitted = self._adopt(fitted, finer)
+                continue
             recorded = len(record.findings), len(record.groups)
             correction = None if effects_alone else self._correction(fitted[-1], first)
             try:
@@ -86,6 +91,9 @@ class Additions:
                 record.forget(*recorded)
                 fitted = self._adopt(fitted, finer)
                 continue
+            if best is not None and self._is_unsettled_remainder(fitted[-1], first, step):
+                record.take_back(*recorded, "there was no time to fit what may explain as much of so small a remainder")
+                break
             if best is not None and correction is not None and not self._explains_more(fitted[-1], best, correction):
                 record.take_back(*recorded, "explains no more than a flexible correction of the effects before it")
                 best = None
@@ -94,6 +102,19 @@ class Additions:
                 break
             fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
         return fitted, detectable
+
+    def _is_futile(self, one: FittedModel) -> bool:
+        """Return whether no further effect could be accepted: down to the noise, less is left than it must remove."""
+        cfg = self.context.cfg
+        quiet = least_ratio(one, self.context.noise_factors) <= cfg.search.explained_ratio
+        return 1 - 1 / one.ratio**2 < (cfg.quiet_min_gain if quiet else cfg.min_gain)
+
+    def _is_unsettled_remainder(self, one: FittedModel, first: FittedModel, step: int) -> bool:
+        """Return whether a model leaves no more than errors in formulas, and the search for a further effect was cut.
+
+        What is established explains nearly all then, and stands without the effect that is not settled.
+        """
+        return step > 0 and step in self.context.budget.cut and self.context.is_form_error(one, first)
 
     def _correction(self, one: FittedModel, first: FittedModel) -> np.ndarray | None:
         """Return the held-out errors of a model with a flexible correction of the effects that were added.

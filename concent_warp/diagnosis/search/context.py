@@ -18,8 +18,9 @@ from concent_warp.diagnosis.time_budget import TimeBudget
 
 T = TypeVar("T")
 
-BASELINE_DONE, ADDITIONS_DONE, REVISION_DONE, VALUES_DONE = 0.1, 0.8, 0.86, 0.95
-"""Shares of a diagnosis that are done after baseline, additions, their revision and the final values. Empirical."""
+BASELINE_DONE, ADDITIONS_DONE, REVISION_DONE, PROFILES_DONE, VALUES_DONE = 0.1, 0.78, 0.8, 0.92, 0.95
+"""Shares of a diagnosis that are done after baseline, additions, their revision, the profile likelihoods and the final
+values. Empirical."""
 ADDITION_PART = 0.75
 """Share of what is left that an addition takes if it is the last, and what is left then if it is not [-]. Empirical."""
 SCREENED_PART, FITTED_PART = 0.4, 0.8

@@ -119,8 +119,11 @@ class AdditionFinder:
         context.enter_addition(step, FITTED_PART, 1.0)
         group = group_indistinguishable(base, accepted, finding, context.runner, cfg, context.budget)
         context.record.rivals[step] = near_best(base, fitted, findings, cfg)
-        context.record.add(group, findings, profile_widening(base, group[0][0]))
-        return group[0][0], smallest
+        best = group[0][0]
+        context.record.add(group, findings, profile_widening(base, best))
+        if best.std is None:
+            context.record.unprofiled[step] = base, best
+        return best, smallest
 
     def _least_promise(self, base: FittedModel) -> float:
         """Return the gain that an effect beside a provisional addition must promise, 0 where there is none.

@@ -27,6 +27,8 @@ class SearchRecord:
     """Models with each effect of a group, of each addition."""
     widening: dict[int, np.ndarray] = field(default_factory=dict)
     """Profile likelihood of each addition over its linear fit, a factor a parameter (P,), see `profile_widening`."""
+    unprofiled: dict[int, tuple[FittedModel, FittedCandidate]] = field(default_factory=dict)
+    """Additions whose profile likelihood is not evaluated: the model that each was added to, and its fit."""
     rivals: dict[int, tuple[Rival, ...]] = field(default_factory=dict)
     """Candidates that explained nearly as much as each addition, and that one itself."""
     time_step: FinerTimeStep | None = None
@@ -102,6 +104,7 @@ class SearchRecord:
         self.hypotheses[step] = {f.name: c.model for c, f in group}
         if best.name != old.name:
             self.widening[step] = np.ones(len(best.parameters))
+            self.unprofiled.pop(step, None)
             self.update(old, replace(old, accepted=False, reason="another one explains more beside the others"))
             self.findings = [f for f in self.findings if f.step != step or f.name != best.name]
             self.findings.append(best)

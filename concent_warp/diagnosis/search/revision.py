@@ -12,9 +12,11 @@ from functools import partial
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import refit_without_effect, without_effect
+from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_without_effect, without_effect
 from concent_warp.diagnosis.candidates.candidate import FittedModel
-from concent_warp.diagnosis.search.context import REVISION_DONE, VALUES_DONE, SearchContext
+from concent_warp.diagnosis.candidates.evidence import profile_widening
+from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
+from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
 from concent_warp.diagnosis.search.joint_fit import (
     joint_finding,
     joint_parameters,
@@ -24,7 +26,7 @@ from concent_warp.diagnosis.search.joint_fit import (
 from concent_warp.diagnosis.search.nominal_values import nominal_effects, nominal_errors, without_nominal_values
 from concent_warp.diagnosis.search.reconsider import reconsider
 from concent_warp.diagnosis.search.time_step import at_given_step, renew_defects
-from concent_warp.diagnosis.time_budget import TOGETHER_SHARE
+from concent_warp.diagnosis.time_budget import PROFILE_SHARE, TOGETHER_SHARE
 
 
 class Revision:
@@ -146,6 +148,26 @@ class Revision:
         reduced = self.context.budget.attempt(refit, None, unsettled)
         return last if reduced is None or _gain_over(reduced, last) >= self.context.cfg.min_gain else reduced
 
+    def profiled(self, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models, with the profile likelihood of each accepted effect in the record.
+
+        Where that of the last addition finds a lower cost, the last model continues there.
+        """
+        context, record, cfg = self.context, self.context.record, self.context.cfg
+        context.runner.enter(REVISION_DONE, PROFILES_DONE)
+        for f in record.accepted():
+            if f.step not in record.unprofiled:
+                continue
+            base, c = record.unprofiled.pop(f.step)
+            is_last = fitted[-1].fit is c.fit
+            refine = partial(refine_by_profile, base, c, context.runner, cfg.profile, restarts=is_last)
+            unsettled = f"Interval of {f.name} from the linear fit, not from its profile likelihood."
+            found = context.budget.attempt(refine, c, unsettled, PROFILE_SHARE)
+            record.widening[f.step] = profile_widening(base, found)
+            if is_last and found.fit.cost < c.fit.cost:
+                fitted = [*fitted[:-1], renew_defects(add_candidate(base, found), cfg.time_step)]
+        return fitted
+
     def final_values(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
 
@@ -173,7 +195,7 @@ class Revision:
         if not accepted and not nominal_effects(fitted[-1].model):
             record.nominal_values = ()
             return fitted, reduced, []
-        context.runner.enter(REVISION_DONE, VALUES_DONE)
+        context.runner.enter(PROFILES_DONE, VALUES_DONE)
         context.progress("fitting all effects together")
         attempt = context.budget.attempt
         unsettled = "Not refitted: all effects together."

@@ -27,7 +27,7 @@ class Judged:
 @pytest.mark.parametrize(
     ("windows", "wider", "better"), [(16, True, True), (17, True, False), (16, False, False), (16, True, False)]
 )
-def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equals(monkeypatch, windows, wider, better):
+def test_the_first_of_a_group_is_polished_and_near_equals_get_a_profile(monkeypatch, windows, wider, better):
     done, cfg = [], DiagnoseCfg(jobs=1)
     fits = [made(n, 0.5) for n in "abcde"]
     pairs: Any = [(c, Judged(c.name, True, "")) for c in fits]
@@ -60,9 +60,7 @@ def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equa
     profiled = wider and windows == 16
     near = [("profile", n) for n in "abc"] if profiled else []
     size = 5 if wider else 2
-    again = [] if profiled and not better else [("profile", "a")]
-    assert done == [
-        ("group", 1.25, 5), ("group", 1.0, 5), *near, ("group", 1.0, size), ("polish", "a", True), *again,
-    ]  # fmt: skip
+    assert done == [("group", 1.25, 5), ("group", 1.0, 5), *near, ("group", 1.0, size), ("polish", "a", True)]
     assert [(f.name, f.accepted, f.reason) for _, f in group] == [("a", True, ""), ("b", True, "")]
-    assert group[0][0].gain == pytest.approx(0.7 if profiled and better else 0.6)
+    assert group[0][0].gain == pytest.approx(0.6 if profiled else 0.5)
+    assert group[0][0].std == ("known" if profiled and not better else None)

@@ -78,7 +78,9 @@ def test_points_farther_away_follow_where_the_cost_does_not_rise(base, found):
     assert _next_distances(base, found, clear, CFG) == []
     farther = [(0, -CFG.step_growth * CFG.first_step), (0, CFG.step_growth * CFG.first_step)]
     assert _next_distances(base, found, flat, CFG) == farther
-    assert _next_distances(base, found, rough, CFG) == farther
+    # A rise of four times the roughness takes 3 x 50 beside it: 0.5 t^2 is that from 17.3 standard deviations on.
+    assert [s.expected_rise for s in rough] == pytest.approx([2.0, 2.0], rel=0.2)
+    assert _next_distances(base, found, rough, CFG) == [(k, CFG.step_growth * t) for k, t in farther]
 
 
 def test_a_profile_flatter_than_its_derivatives_widens_the_interval(base, found):

@@ -170,3 +170,57 @@ def test_an_addition_takes_three_quarters_of_what_is_left_and_begins_earlier_tha
     made.context.enter_addition(1, 0.25, 0.7)
     assert made.context.runner.share == pytest.approx(1 - left[1] + 0.25 * 0.75 * left[1])
     assert made.context.runner.end == pytest.approx(1 - left[1] + 0.7 * 0.75 * left[1])
+
+
+def test_no_further_effect_is_searched_where_less_is_left_than_it_must_remove(monkeypatch):
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    finer = node(1.04, 30.0, timestep=FINER)
+    for left, shorter, searched, steps in (
+        (1.06, None, 1, [GIVEN, GIVEN]),  # at most 11 % can go; an effect beside so little must remove 12.5 %
+        (1.08, None, 2, [GIVEN, GIVEN]),  # 14 %
+        (1.12, None, 2, [GIVEN, GIVEN]),  # an effect must remove 5 % here
+        (1.06, finer, 1, [GIVEN, FINER]),  # as where no effect explains more
+    ):
+        made, asked, after = procedure(), [], node(left, effects=1)
+
+        def find(_base, step, *, explained, asked=asked, after=after):
+            asked.append((step, explained))
+            return (None if step else after), ()
+
+        monkeypatch.setattr(made.additions.finder, "find", find)
+        monkeypatch.setattr(
+            additions, "finer_time_step", lambda one, _cfg, shorter=shorter: None if one.ratio > 2 else shorter
+        )
+        monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
+        monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+        fitted, _ = made.additions.add_effects([node(3.0)], ())
+        assert len(asked) == searched
+        assert [one.timestep for one in fitted] == steps
+
+
+def test_an_effect_whose_rivals_were_not_fitted_in_time_is_not_added_to_one_that_explains_nearly_all(monkeypatch):
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    # 1.2 x noise is 2 % of what 5 lack and 15 % of what 2 lack: then what is established does not dominate.
+    for first, cut, count, accepted in (
+        (5.0, True, 2, [True, False]),
+        (2.0, True, 3, [True, True]),
+        (5.0, False, 3, [True, True]),
+    ):
+        made, nodes = procedure(), [node(first), node(1.2, effects=1), node(1.0, effects=2)]
+
+        def find(_base, step, *, made=made, nodes=nodes, cut=cut, **_):
+            made.record.groups.append((f"effect {step}",))
+            made.record.hypotheses.append({})
+            made.record.findings.append(finding(f"effect {step}", 0.6, step=step))
+            if cut and step:
+                made.context.budget.note("Not fitted: drag.", step)
+            return nodes[step + 1], ()
+
+        monkeypatch.setattr(made.additions.finder, "find", find)
+        assert made.additions.add_effects(nodes[:1], ())[0] == nodes[:count]
+        assert [f.accepted for f in made.record.findings] == accepted
+        assert len(made.record.groups) == count - 1
+        steps = [f.step for f in made.record.accepted()]
+        assert made.context.budget.verdict("effect", steps) == ("unsettled" if first == 2.0 else "effect")

@@ -17,7 +17,7 @@ from tests.diagnosis.made_up import CLEAR, OPEN, finding, node, procedure
 class MadeUp(SimpleNamespace):
     """A fitted candidate."""
 
-    fit = "its fit"
+    fit, std = "its fit", None
 
     def share(self, base: Any) -> float:
         """Return its gain over a baseline."""
@@ -87,6 +87,7 @@ def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
     assert "rivals" not in notes
     assert made.record.groups == [("a", "b")]
     assert made.record.widening == {1: "width of a"}
+    assert [(base.ratio, c.name) for base, c in made.record.unprofiled.values()] == [(2.0, "a")]
     assert [{n: m.name for n, m in models.items()} for models in made.record.hypotheses] == [
         {"a": "model a", "b": "model b"}
     ]

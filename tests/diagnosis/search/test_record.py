@@ -12,11 +12,12 @@ from tests.diagnosis.made_up import MODEL, finding
 
 
 def test_a_copy_of_a_record_has_all_of_it_and_does_not_change_with_it():
-    made_up: Any = ("rival",), "a shorter time step", ("value",), ["a model"]
-    rivals, time_step, values, models = made_up
+    made_up: Any = ("rival",), "a shorter time step", ("value",), ["a model"], {0: ("a model", "a fit")}
+    rivals, time_step, values, models, unprofiled = made_up
     record = SearchRecord(
-        [finding("a", 0.5)], [("a",)], [{"a": MODEL}], {0: np.ones(1)}, {0: rivals}, time_step, values, 1, True, models
-    )
+        [finding("a", 0.5)], [("a",)], [{"a": MODEL}], {0: np.ones(1)}, unprofiled, {0: rivals},
+        time_step, values, 1, True, models,
+    )  # fmt: skip
     assert all(getattr(record, f.name) for f in fields(SearchRecord))
     copied = record.copy()
     assert copied == record
@@ -26,9 +27,11 @@ def test_a_copy_of_a_record_has_all_of_it_and_does_not_change_with_it():
     record.groups[0], record.rivals[1] = ("a", "b"), rivals
     record.hypotheses.append({})
     record.widening[1] = np.ones(2)
+    record.unprofiled.pop(0)
     record.with_unestablished.append(models[0])
     assert ([(f.name, f.accepted) for f in copied.findings], copied.groups, copied.rivals) == before
     assert (len(copied.hypotheses), list(copied.widening), copied.with_unestablished) == (1, [0], ["a model"])
+    assert copied.unprofiled == {0: ("a model", "a fit")}
 
 
 def test_an_effect_that_takes_the_place_of_an_accepted_one_is_recorded_once():

@@ -13,6 +13,7 @@ from concent_warp.diagnosis import procedure as module
 from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.search import additions, context, revision
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
+from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.made_up import CLEAR, FINER, GIVEN, OPEN, finding, interval, node, procedure
 
 
@@ -118,6 +119,44 @@ def test_a_dropped_addition_leaves_the_effects_that_were_reconsidered_beside_it(
     assert made.revision.simplified(nodes) == [nodes[0], left]
     assert asked == [(swapped, 1)]
     assert [f.name for f in made.record.findings if f.accepted] == ["b"]
+
+
+def test_profile_likelihoods_of_accepted_effects_are_evaluated_after_the_search(monkeypatch):
+    asked: list[Any] = []
+
+    def refine(base, c, runner, cfg, *, restarts):
+        asked.append((base, c.name, runner, cfg, restarts))
+        if c.name == "late":
+            raise TimeUpError
+        return SimpleNamespace(name=f"{c.name} refined", fit=SimpleNamespace(cost=c.fit.cost - c.fall))
+
+    monkeypatch.setattr(revision, "refine_by_profile", refine)
+    monkeypatch.setattr(revision, "profile_widening", lambda base, c: f"{c.name} at {base}")
+    monkeypatch.setattr(revision, "add_candidate", lambda base, c: f"{base} with {c.name}")
+    monkeypatch.setattr(revision, "renew_defects", lambda one, _cfg: one)
+    first, last = node(5.0, 50.0), node(1.0, 10.0, effects=2)
+    for name, fall, fit, left, widths in (
+        ("b", 1.0, last.fit, "base b with b refined", {0: "a refined at base a", 1: "b refined at base b"}),
+        ("b", 0.0, last.fit, last, {0: "a refined at base a", 1: "b refined at base b"}),
+        # Fitted again since, with nominal values say: a lower cost beside the earlier fit is none beside this one.
+        ("b", 1.0, SimpleNamespace(cost=11.0), last, {0: "a refined at base a", 1: "b refined at base b"}),
+        ("late", 1.0, last.fit, last, {0: "a refined at base a", 1: "late at base b"}),
+    ):
+        made, asked[:] = procedure(), []
+        made.record.findings = [
+            finding("a", 0.5),
+            finding(name, 0.4, step=1),
+            finding("c", 0.1, accepted=False, step=2),
+        ]
+        fits: Any = [SimpleNamespace(name="a", fit=first.fit, fall=1.0), SimpleNamespace(name=name, fit=fit, fall=fall)]
+        made.record.unprofiled = {k: (f"base {n}", c) for k, (n, c) in enumerate(zip("ab", fits, strict=True))}
+        made.record.unprofiled[2] = ("base c", "not accepted")
+        assert made.revision.profiled([first, last]) == [first, left]
+        assert made.record.widening == widths
+        shared = made.context.runner, made.context.cfg.profile
+        assert asked == [("base a", "a", *shared, False), ("base b", name, *shared, fit is last.fit)]
+        late = ["Interval of late from the linear fit, not from its profile likelihood."]
+        assert made.context.budget.unsettled == (late if name == "late" else [])
 
 
 def rivals(*names: str, step: int = 0) -> tuple[Rival, ...]:
