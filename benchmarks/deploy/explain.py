@@ -146,8 +146,8 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
     trials = [one == row["cause"] for row in judged.values() for one in row.get("one by one", [])]
     summary.append(["all", *_shares(every), *_shares(trials)])
     physics = [row for row in judged.values() if row["cause"] == "physics"]
-    named = [row.get("effects", [])[:1] == [row["effect"]] for row in physics]
-    grouped = [any(row["effect"] in group for group in row.get("groups", [])[:1]) for row in physics]
+    named = [_kinds(row.get("effects", [])[:1]) == [row["effect"]] for row in physics]
+    grouped = [any(row["effect"] in _kinds(group) for group in row.get("groups", [])[:1]) for row in physics]
     for name, row in rows.items():
         found = ", ".join(row.get("effects", []))
         bias = row.get("bias")
@@ -166,6 +166,11 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
         machines(rows), "## Causes named rightly", table(head, summary), effects, "## Cases", table(columns, detail),
     ]  # fmt: skip
     return "\n\n".join(part.strip() for part in parts)
+
+
+def _kinds(names: Sequence[str]) -> list[str]:
+    """Return names of effects without the joints that they act on."""
+    return [name.partition("(")[0] for name in names]
 
 
 def _shares(right: Sequence[bool]) -> list[str]:
