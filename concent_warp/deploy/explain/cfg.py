@@ -105,7 +105,7 @@ class ExplainCfg:
     """Whether the missing physical effect is searched for, which takes minutes."""
     diagnose_trials: Count = 2
     """Failed trials that it is searched for in, where the joints do not differ in free motion."""
-    free_trials: Count = 8
+    free_trials: Count = 4
     """Trials, failed ones first, that it is searched for in up to their first contact, where the joints differ in free
     motion: without contacts it is found in less time, and nothing else can be the reason."""
     effects: tuple[str, ...] = ()
