@@ -161,7 +161,7 @@ def test_free_motion_ends_before_the_object_comes_near_anything(
     touching, moving = prepared[1]
     moving = replace(moving, free_error=9.0, free_time=0.6)
     assert touching.free_error is None  # 12 mm too low, it touches from the start
-    given = Recording(policy.run.model.scene, (moving.demonstration,))
+    given = Recording(policy.run.recording.scene, (moving.demonstration,))
     found = _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, None)._free_motion([touching, moving])
     assert len(found.demonstrations) == 1
     ends = [float(channel.time[-1]) for channel in found.demonstrations[0].measured.values()]

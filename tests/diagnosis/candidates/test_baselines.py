@@ -203,7 +203,7 @@ def test_points_of_a_profile_stay_within_bounds_and_go_on_where_the_cost_rises_l
     assert _next_distances(base, c, [], cfg) == [(1, -2.0), (1, 2.0)]
 
     def point(distance: float, cost: float) -> Any:
-        return SimpleNamespace(parameter=1, distance=distance, cost=cost, expected_rise=0.0)
+        return SimpleNamespace(parameter=1, distance=distance, cost=cost, expected_rise=1.0, overdispersion=1.0)
 
     assert _next_distances(base, c, [point(-2.0, 10.5), point(2.0, 10.5)], cfg) == [(1, 6.0)]  # -6 is below the bound
     assert _next_distances(base, c, [point(-2.0, 11.0), point(2.0, 9.0)], cfg) == [(1, 6.0)]
@@ -214,11 +214,11 @@ def test_points_of_a_profile_stay_within_bounds_and_go_on_where_the_cost_rises_l
             profile_likelihood, "_next_distances", lambda _b, _c, points, _cfg: [(1, 2.0 + len(points))]
         )
         monkeypatch.setattr(profile_likelihood, "profile_point", lambda *_, left=left: point(2.0, next(left)))
-        found = _profile(base, c, TaskRunner(), cfg, 1.0)
+        found = _profile(base, c, TaskRunner(), cfg, restarts=True)
         rounds.append(len(found))
         assert len(found) == count
     monkeypatch.setattr(profile_likelihood, "_next_distances", lambda *_: [])
-    assert _profile(base, c, TaskRunner(), cfg, 1.0) == []
+    assert _profile(base, c, TaskRunner(), cfg, restarts=True) == []
     assert rounds == [4, 2, 1]
 
 
