@@ -44,9 +44,10 @@ trial failed, the case says nothing. *All together* is the verdict from six fail
 
 47 of 60 cases were begun and ended on a machine that was held for half an hour; 13, among them the policies with noise
 and the short trainings, were not. A diagnosis had 600 s of one slow processor. Those of these cases searched in two
-whole trials, contacts included; the present version searches in the robot's free motion where this differs. Tried since,
-in the free motion of eight trials, on two cores beside much other work: `gravity_compensation=0.2` and `joint_friction=3` with other seeds, both named
-rightly after 600 and 357 s; `joint_friction=3` and `stribeck_friction=4`, unsettled after 600 s of a quarter of a core.
+whole trials, contacts included; the present version searches in the robot's free motion where this differs. Tried
+since, in the free motion of eight trials, on two cores beside much other work: `gravity_compensation=0.2` and
+`joint_friction=3` with other seeds, both named rightly after 600 and 357 s; `joint_friction=3` and
+`stribeck_friction=4`, unsettled after 600 s of a quarter of a core.
 
 What the figures do not show: other tasks and robots; two causes at once; errors of poses that differ from trial to
 trial; trials without tracked poses.

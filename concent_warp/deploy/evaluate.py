@@ -24,6 +24,7 @@ from concent_warp.scene.cameras import BASE_FOVY
 from concent_warp.train.distil.cfg import ImagesCfg
 from concent_warp.train.distil.student import Student
 from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.state_estimate import check_biased
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.flow.task_policy import TaskFlowPolicy
 from concent_warp.train.policy.load import Policy
@@ -89,6 +90,7 @@ def evaluate(
     videos = _video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
     run = policy.run
+    check_biased(cfg.sensors, run.model.scene.objects())
     if world == "stress":
         test = run.stress_test(device=device, episodes=episodes, seed=seed)
         torch.manual_seed(seed)

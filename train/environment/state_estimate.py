@@ -8,7 +8,7 @@ past counts relative to where the hand was then.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -200,14 +200,24 @@ class StateEstimate:
                 mocap[1][:, fixture] = turn.to(mocap[1].dtype)
 
 
+def check_biased(sensors: SensorErrorsCfg, objects: Sequence[str]) -> None:
+    """Check that the objects whose poses have an error are known.
+
+    Raises:
+        TrainError: The settings name an object that the task lacks.
+    """
+    if unknown := sorted(set(sensors.biased) - set(objects)):
+        known = f"some of {list(objects)}"
+        raise TrainError("the poses of an unknown object are biased", expected=known, found=unknown)
+
+
 def _bias(sensors: SensorErrorsCfg, objects: list[str]) -> torch.Tensor:
     """Return the bias of each object's poses: position [m], rotation vector [rad], shape (O, 6).
 
     Raises:
         TrainError: The settings name an object that the task lacks.
     """
-    if unknown := sorted(set(sensors.biased) - set(objects)):
-        raise TrainError("the poses of an unknown object are biased", expected=f"some of {objects}", found=unknown)
+    check_biased(sensors, objects)
     bias = torch.tensor([*sensors.position_bias, *sensors.orientation_bias])
     return torch.stack([bias * (not sensors.biased or name in sensors.biased) for name in objects])
 
