@@ -103,9 +103,7 @@ def with_intervals(
     independent = np.hypot(errors.nominal, errors.formula / scale)
     covered = covariance(sums, last.blocks, prior)
     posterior = joint_posterior(prediction.parameters, fitted, covered, errors.data, independent)
-    return replace(
-        last, model=prediction.model(last.fit.values, [(p.low, p.high) for p in fitted], posterior)
-    )  # fmt: skip
+    return replace(last, model=prediction.model(last.fit.values, [(p.low, p.high) for p in fitted], posterior))
 
 
 @dataclass(frozen=True)
