@@ -21,6 +21,7 @@ def distil(
     policy: Policy,
     cfg: DistilCfg | None = None,
     *,
+    begin_with: Student | None = None,
     device: str | None = None,
     seconds: float | None = None,
     out: str | Path | None = None,
@@ -36,6 +37,8 @@ def distil(
     Args:
         policy: The teacher.
         cfg: Settings.
+        begin_with: Student to begin with, of the same network; random weights by default. Images may have another
+            size.
         device: Warp's name of the device; the first CUDA device by default, the CPU without one.
         seconds: Time after which to stop [s].
         out: Run folder for checkpoints, metrics and the teacher; None writes none.
@@ -44,8 +47,8 @@ def distil(
         progress: Called after every iteration.
 
     Raises:
-        TrainError: The folder's distillation was started with other settings or another teacher, or worlds or samples
-            do not fit the memory.
+        TrainError: The folder's distillation was started with other settings or another teacher, worlds or samples do
+            not fit the memory, or the student to begin with has another network.
         RenderError: A camera is not there, or networks or splats cannot be used.
         ConcentError: The folder holds a run and neither `resume` nor `overwrite` is given.
 
@@ -82,5 +85,6 @@ def distil(
             seconds=seconds,
             process=process,
             begun=None if claimed is None else begin,
+            begin_with=None if begin_with is None else begin_with.weights,
         )
     return Student(policy, cfg, trainer.weights(), folder or Path())

@@ -157,6 +157,8 @@ class RandomisedImages:
         shape = self._waves.shape[:3]
         low, high = self._looks.pattern_length
         direction = torch.randn(*shape, 3, device=self._device)
+        striped = self._uniform((0.0, 1.0), *shape[:2], 1, 1) < self._looks.stripe_share
+        direction = torch.where(striped, direction[:, :, :1], direction)
         direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True).clamp(min=1e-6)
         # The waves of a pattern have lengths of about one size.
         length = low * (high / low) ** self._uniform((0.0, 1.0), *shape[:2], 1, 1)

@@ -121,14 +121,14 @@ def test_images_are_as_late_as_their_delay_and_begin_anew_with_an_episode():
 
 def test_a_keypoint_follows_a_bright_spot():
     torch.manual_seed(0)
-    encoder = CameraEncoder(3, cw.StudentNetworkCfg(channels=(8, 8), keypoints=8), 32)
+    encoder = CameraEncoder(3, cw.StudentNetworkCfg(channels=(8, 8), keypoints=8, blocks=0))
     places = torch.zeros(2, 8, 2)
     for k, column in enumerate((6, 26)):
         image = -torch.ones(1, 3, 32, 32)
         image[..., 14:18, column - 2 : column + 2] = 1
         with torch.no_grad():
             # Sharp scores: random weights prefer no place by much.
-            list(encoder.layers.parameters())[-2].mul_(50 if k == 0 else 1)
+            encoder.scores.weight.mul_(50 if k == 0 else 1)
             places[k] = encoder(image)[0, :16].view(2, 8).T
     moved = (places[1] - places[0]).abs()
     across, down = moved[moved[:, 0].argmax()].tolist()
@@ -139,7 +139,7 @@ def test_a_keypoint_follows_a_bright_spot():
 def network(**settings: bool) -> StudentNetwork:
     torch.manual_seed(0)
     cfg = cw.StudentNetworkCfg(channels=(8, 8), keypoints=4, hidden=(16,), **settings)
-    return StudentNetwork(2, 1, 16, 5, 3, 2, cfg).eval()
+    return StudentNetwork(2, 1, 5, 3, 2, cfg).eval()
 
 
 def test_an_action_changes_with_the_image_unless_the_student_is_blind():

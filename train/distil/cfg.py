@@ -43,7 +43,7 @@ class ImagesCfg:
     base_fovy: OpenAngle = 24.0
     """Vertical field of view of the camera "base" where it is added [degrees]: so narrow that few pixels show where
     the objects are to some millimetres."""
-    size: Annotated[int, Bounds(8, 1024)] = 64
+    size: Annotated[int, Bounds(8, 1024)] = 96
     """Height and width of an image [px]."""
     frames: Annotated[int, Bounds(1, 8)] = 1
     """Successive images of a camera that the student sees at once, one control step apart."""
@@ -61,7 +61,8 @@ class ImagesCfg:
 
 @dataclass(frozen=True)
 class LooksCfg:
-    """Random appearance of the ray-traced scene; values are sampled for each world when an episode begins.
+    """Random appearance of the ray-traced scene; values are sampled for each world when an episode begins, and anew
+    in training.
 
     Example:
         >>> import concent_warp as cw
@@ -77,11 +78,13 @@ class LooksCfg:
     """Largest contrast of random patterns on surfaces [-]."""
     pattern_length: PositiveInterval = (0.004, 0.3)
     """Range of the wavelengths of the patterns, log-uniform [m]."""
-    grain_share: Share = 0.3
+    stripe_share: Share = 0.3
+    """Share of patterns whose waves all run in one direction, as the grain of wood does."""
+    grain_share: Share = 0.5
     """Share of surfaces that are divided into small cells of random brightness, as speckled or grained ones are."""
     grain: Share = 0.7
     """Largest contrast of these cells [-]."""
-    grain_length: PositiveInterval = (0.008, 0.05)
+    grain_length: PositiveInterval = (0.002, 0.05)
     """Range of the edge of a cell, log-uniform [m]."""
     lights: Annotated[int, Bounds(1, 16)] = 2
     """Lamps, in place of those of the scene; the first casts shadows."""
@@ -100,6 +103,9 @@ class LooksCfg:
     camera_angle: Duration = 0.6
     """Largest rotation of a camera about each of its axes [degrees]; likewise. A degree at a distance of one metre
     displaces what is seen by 17 mm, more than a grasp forgives."""
+    renewed: Share = 0.05
+    """Share of the worlds whose looks are sampled anew in each step of the training, besides those in which an episode
+    begins: more looks are learned from than there are episodes. None with several successive images."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +118,8 @@ class AugmentCfg:
         4
     """
 
-    shift: Annotated[int, Bounds(0, 64)] = 2
-    """Largest shift of an image along each axis [px]."""
+    shift: Annotated[int, Bounds(0, 64)] = 0
+    """Largest shift of an image along each axis [px]; none, since a shifted image shows everything elsewhere."""
     brightness: Share = 0.35
     """Largest relative change of the brightness [-]."""
     contrast: Share = 0.25
@@ -132,7 +138,7 @@ class AugmentCfg:
 
 @dataclass(frozen=True)
 class StudentNetworkCfg:
-    """The student's network: a convolutional network for each camera, and a multi-layer perceptron.
+    """The student's network: a residual network for each camera, and a multi-layer perceptron.
 
     Example:
         >>> import concent_warp as cw
@@ -140,12 +146,13 @@ class StudentNetworkCfg:
         True
     """
 
-    channels: tuple[Annotated[int, Bounds(8, 4096)], ...] = (32, 48, 48, 64)
-    """Channels of the convolutions, multiples of 8; the first halves the resolution, those after the second look twice
-    as far as the one before."""
+    channels: tuple[Annotated[int, Bounds(8, 4096)], ...] = (32, 64, 128)
+    """Channels of the stages, multiples of 8; each stage halves the resolution."""
+    blocks: Annotated[int, Bounds(0, 64)] = 2
+    """Residual blocks of each stage but the first."""
     keypoints: Annotated[int, Bounds(1, 4096)] = 32
     """Channels whose spatial softmax is taken: each is a position in the image."""
-    hidden: tuple[Annotated[int, Bounds(1, 100_000)], ...] = (512, 256)
+    hidden: tuple[Annotated[int, Bounds(1, 100_000)], ...] = (1024, 512)
     """Sizes of the hidden layers of the perceptron."""
     blind: bool = False
     """Show the student black images: a control."""
@@ -188,7 +195,7 @@ class DaggerCfg:
     """Gradient steps in which the learning rate rises."""
     decay: Share = 1e-4
     """Weight decay [-]."""
-    auxiliary: Share = 0.1
+    auxiliary: Share = 0.5
     """Weight of the loss on the predicted poses of the objects [-]."""
     normalise_iterations: Count = 50
     """Iterations in which mean and standard deviation of the proprioception are estimated."""

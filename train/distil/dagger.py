@@ -23,7 +23,7 @@ from concent_warp.errors import TrainError
 from concent_warp.train.distil.augmentation import augmented
 from concent_warp.train.distil.cfg import DistilCfg
 from concent_warp.train.distil.images import DelayedImages, ImageSource
-from concent_warp.train.distil.network import StudentNetwork, scaled_poses
+from concent_warp.train.distil.network import POSITION_SCALE, StudentNetwork, scaled_poses
 from concent_warp.train.distil.proprioception import Proprioception
 from concent_warp.train.distil.samples import Samples
 from concent_warp.train.environment.environment import Environment
@@ -37,6 +37,10 @@ RECENT = 200
 """Latest episodes whose share of successes is reported."""
 HUBER = 0.2
 """Difference of an action from its label above which the loss is linear [-]."""
+SETTLED = 1e9
+"""Number of samples that mean and standard deviation of another student's proprioception count as."""
+POSE_HUBER = 0.1
+"""The same of a scaled pose: 5 mm."""
 
 
 class Dagger:
@@ -161,7 +165,7 @@ class Dagger:
         self.network.train()
         losses = self._learn()
         losses = self.process.sum_over_ranks(losses) / self.process.world_size
-        action, poses = losses.tolist()
+        action, poses, *positions = losses.tolist()
         if not math.isfinite(action + poses):
             raise TrainError(
                 "the distillation diverged: the loss is not finite",
@@ -174,6 +178,8 @@ class Dagger:
         self.steps += steps
         self.seconds += end - start
         log |= {"loss action": action, "loss poses": poses, "beta": beta, "learning rate": self._rate()}
+        if positions:
+            log["position error"] = positions[0]
         return Iteration(
             self.iteration, self.steps, self.seconds, collected - start, end - collected, steps / (end - start), log
         )
@@ -181,7 +187,7 @@ class Dagger:
     def _collect(self, beta: float) -> None:
         """Take one step in all worlds and keep its sample."""
         environment, started = self.environment, self._started
-        seen = self._images.look(environment, started).to(self.device)
+        seen = self._look(started).to(self.device)
         own, truth = self._proprioception.read(environment.observation).clone(), environment.truth
         given = self._teacher_observation()
         label = self._teacher(TensorDict({"policy": given}, batch_size=[len(given)])).clamp(-1, 1)
@@ -194,6 +200,12 @@ class Dagger:
             action = torch.where(self._taught[:, None], label, action)
         environment.step(action)
         self._count()
+
+    def _look(self, started: torch.Tensor) -> torch.Tensor:
+        """Return the images of the present states, of which some worlds look otherwise from now on."""
+        share = self.cfg.looks.renewed if self.cfg.images.frames == 1 else 0.0
+        renewed = torch.rand(len(started), device=started.device) < share if share else None
+        return self._images.look(self.environment, started, renewed)
 
     def _teacher_observation(self) -> torch.Tensor:
         """Return what the teacher observes, shape (N, O)."""
@@ -228,11 +240,11 @@ class Dagger:
         return self.samples.proprioception[rows]
 
     def _learn(self) -> torch.Tensor:
-        """Take the gradient steps of an iteration; return the mean losses of actions and of poses, shape (2,)."""
+        """Take the gradient steps of an iteration; return the mean of what `losses` returns, shape (3,)."""
         return torch.stack([self._update() for _ in range(self.cfg.dagger.updates)]).mean(dim=0)
 
     def _update(self) -> torch.Tensor:
-        """Take a gradient step on random samples; return the losses of actions and of poses, shape (2,)."""
+        """Take a gradient step on random samples; return what `losses` returns, shape (3,)."""
         d = self.cfg.dagger
         for group in self._optimiser.param_groups:
             group["lr"] = self._rate()
@@ -247,7 +259,7 @@ class Dagger:
         return losses.detach()
 
     def losses(self, images: torch.Tensor, own: torch.Tensor, label: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-        """Return the losses of actions and of poses, shape (2,).
+        """Return the losses of actions and of poses, and the mean error of predicted positions [m], shape (3,).
 
         Args:
             images: Colours 0..1, shape (N, C, 3 F, size, size).
@@ -257,7 +269,9 @@ class Dagger:
         """
         action, predicted = self.network.both(images, own)
         first = functional.smooth_l1_loss(action, label, beta=HUBER)
-        return torch.stack([first, functional.smooth_l1_loss(predicted, poses)])
+        second = functional.smooth_l1_loss(predicted, poses, beta=POSE_HUBER)
+        positions = (predicted - poses).detach().unflatten(1, (-1, 9))[..., :3] / POSITION_SCALE
+        return torch.stack([first, second, torch.linalg.vector_norm(positions, dim=2).mean()])
 
     def _rate(self) -> float:
         """Return the learning rate of the next gradient step."""
@@ -348,6 +362,24 @@ class Dagger:
         assert self.folder is not None
         return self.folder / f"samples_{self.process.rank}_{iteration}.bin"
 
+    def begin_with(self, weights: dict[str, Any], where: object = None) -> None:
+        """Begin with the network of another distillation.
+
+        Args:
+            weights: As `weights` returns them.
+            where: Where they are from, for errors.
+
+        Raises:
+            TrainError: The network is another one.
+        """
+        check_state(
+            weights["student"], self.network.state_dict(), "the student to begin with", where=where, error=TrainError
+        )
+        self.network.load_state_dict(weights["student"])
+        # Its mean and standard deviation stay, whatever the first samples are.
+        mean, std = (self.network.get_buffer(name).double() for name in ("mean", "std"))
+        self._moments = SETTLED * torch.cat([mean, mean.square() + std.square(), mean.new_ones(1)])
+
     def resume(self, path: Path) -> None:
         """Restore the training of a checkpoint; it continues as if it had not stopped.
 
@@ -392,9 +424,8 @@ class Dagger:
 def make_network(cfg: DistilCfg, proprioception: Proprioception, actions: int) -> StudentNetwork:
     """Return a student's network with random weights, on the CPU."""
     return StudentNetwork(
-        len(cfg.images.cameras), cfg.images.frames, cfg.images.size, proprioception.size, actions,
-        proprioception.objects, cfg.network,
-    )  # fmt: skip
+        len(cfg.images.cameras), cfg.images.frames, proprioception.size, actions, proprioception.objects, cfg.network
+    )
 
 
 def load_student_checkpoint(path: Path) -> dict[str, Any]:

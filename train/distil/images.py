@@ -59,14 +59,17 @@ class DelayedImages:
         self._kept: torch.Tensor | None = None
         self._delay = torch.zeros(0, dtype=torch.long)
 
-    def look(self, environment: Environment, started: torch.Tensor) -> torch.Tensor:
+    def look(
+        self, environment: Environment, started: torch.Tensor, renewed: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Return what is seen of the present states, uint8, shape (N, C, 3 F, size, size), the latest image first.
 
         Args:
             environment: The worlds.
             started: Worlds in which an episode begins, shape (N,) bool; before it, all was as it is.
+            renewed: Worlds whose random looks are sampled anew besides, shape (N,) bool.
         """
-        self.source.begin(started)
+        self.source.begin(started if renewed is None else started | renewed)
         present = self.source.render(environment.physics.qpos, environment.physics.mocap)
         low, high = self._range
         length = high + self._frames

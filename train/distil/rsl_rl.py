@@ -37,7 +37,7 @@ class RslRlDagger(Dagger):
         del beta
         environment, started = self.environment, self._started
         parts = {
-            IMAGES: self._images.look(environment, started).clone(),
+            IMAGES: self._look(started).clone(),
             OWN: self._proprioception.read(environment.observation).clone(),
             STATE: self._teacher_observation(),
         }

@@ -94,6 +94,7 @@ def run_distillation(
     seconds: float | None = None,
     process: DistributedProcess | None = None,
     begun: Callable[[], Path] | None = None,
+    begin_with: dict[str, Any] | None = None,
 ) -> tuple[Dagger, Iteration | None]:
     """Train a student, and return the trainer and its last iteration.
 
@@ -106,6 +107,7 @@ def run_distillation(
         seconds: Time after which to stop [s].
         process: This process of a data-parallel training, within its group; a single process by default.
         begun: Called when all is set up and a checkpoint is written; returns the run folder from then on.
+        begin_with: Weights of another student, unless a distillation is resumed.
 
     Raises:
         TrainError: The folder's distillation was started with other settings or another teacher, or the worlds or the
@@ -125,6 +127,8 @@ def run_distillation(
         environment.reset()
         if resume and folder is not None:
             trainer.resume(folder / CHECKPOINT)
+        elif begin_with is not None:
+            trainer.begin_with(begin_with)
         if folder is not None and process.is_rank_zero:
             inputs.save(folder)
     if not resume:

@@ -33,6 +33,8 @@ class Arguments:
     """Run folder of concent train, its checkpoint file, or the name of a policy that comes with the package."""
     out: OptionalOutPath = None
     """Run folder; by default runs/student_<name of the teacher>."""
+    begin_with: Path | None = None
+    """Run folder of a student to begin with, for other looks or a larger size of the images."""
     device: DeviceOption = None
     resume: bool = False
     """Continue an interrupted distillation, as if it had not stopped."""
@@ -74,6 +76,9 @@ def run(arguments: Arguments) -> Student:
     teacher = given_policy(*given)
     quiet_warp()
     from concent_warp.deploy.distil import distil
+    from concent_warp.train.distil.student import load_student
+
+    begin_with = None if arguments.begin_with is None else load_student(arguments.begin_with)
 
     last: Iteration | None = None
     with status_bar("distilling") as update:
@@ -89,6 +94,7 @@ def run(arguments: Arguments) -> Student:
         student = distil(
             teacher,
             cfg,
+            begin_with=begin_with,
             device=arguments.device,
             out=folder,
             resume=arguments.resume,
