@@ -74,15 +74,6 @@ class SearchContext:
         share = self.cfg.max_form_error if (record or self.record).form_corrected else self.cfg.unknown_force.min_share
         return left < share * lacked and one.ratio <= self.cfg.form_error_ratio
 
-    def may_be_form_error(self, one: FittedModel, first: FittedModel) -> bool:
-        """Return whether what a model with added effects leaves may be errors in their formulas, by its size alone.
-
-        It is then no larger than what counts as noise in a model as given, and at most `DiagnoseCfg.max_form_error`.
-        Its structure tells such errors from what an imitation leaves.
-        """
-        left, lacked = discrepancies(one, first)
-        return left < self.cfg.max_form_error * lacked and is_adequate(one, self.noise_factors, self.cfg)
-
     def explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
         """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.
 
