@@ -9,6 +9,7 @@ import pytest
 
 from concent_warp.diagnosis.candidates.baseline import fit_baseline, held_out_errors, refit_without_effect
 from concent_warp.diagnosis.candidates.screening import screen
+from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.effects.library.joints import JointDamping, JointFriction
@@ -83,6 +84,8 @@ def test_a_candidate_promises_nothing_that_a_nominal_value_beyond_its_bound_woul
     windows = observe(model, recording)
     base = fit_baseline(model, windows, cut_blocks(windows))
     assert base.model.effects[0].values == pytest.approx((0.98,))
+    assert has_bounded_nominal_values(base.model)
+    assert not has_bounded_nominal_values(model)
     assert base.ratio > 3
     assert screen(base, ActuatorGain("servo")).expected_gain > 0.9
     assert screen(base, JointFriction("hinge")).expected_gain < 0.1
