@@ -38,6 +38,10 @@ class StepState(NamedTuple):
     qfrc_actuator: np.ndarray
     qfrc_bias: np.ndarray
     qfrc_applied: np.ndarray
+    xfrc_applied: np.ndarray
+    xipos: np.ndarray
+    geom_xpos: np.ndarray
+    geom_xmat: np.ndarray
     sensordata: np.ndarray
     dof_frictionloss: np.ndarray
     dof_armature: np.ndarray
@@ -54,7 +58,7 @@ class StepState(NamedTuple):
 
 FREE = 1e9
 """Limit of an actuator's force that is none [N m or N]."""
-WIDTH = 24
+WIDTH = 28
 """Most numbers of a row."""
 
 Row = tuple[list[int], list[float]]
@@ -200,7 +204,95 @@ def push_by_bump(begun: bool, whole: Numbers, real: Numbers, state: StepState) -
     state.qfrc_applied[whole[0]] += real[2] * math.exp(-0.5 * x * x)
 
 
-FORCES = (add_stribeck, add_load, pass_play, drive_by_spring, push_by_bump)
+@inlined
+def pull_to_plane(begun: bool, whole: Numbers, real: Numbers, state: StepState) -> None:
+    """Act on a body at those points of a geom that lie within a gap of a plane, see `AdhesionForce`.
+
+    Before the first step nothing is known of where geoms are, and nothing acts.
+
+    Args:
+        begun: Whether this is not the first step.
+        whole: Geom, plane, body, number of points.
+        real: Strength, gap, radius and reach of the geom, points in its frame.
+        state: MuJoCo's arrays.
+    """
+    if not begun:
+        return
+    centre, turn, middle = state.geom_xpos[whole[0]], state.geom_xmat[whole[0]], state.xipos[whole[2]]
+    place, axes = state.geom_xpos[whole[1]], state.geom_xmat[whole[1]]
+    nx, ny, nz = axes[2], axes[5], axes[8]
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    strength, gap, radius = real[0], real[1], real[2]
+    height = cx * nx + cy * ny + cz * nz - (place[0] * nx + place[1] * ny + place[2] * nz)
+    if height > real[3]:
+        return
+    ax = nx * turn[0] + ny * turn[3] + nz * turn[6]
+    ay = nx * turn[1] + ny * turn[4] + nz * turn[7]
+    az = nx * turn[2] + ny * turn[5] + nz * turn[8]
+    below, count, sx, sy, sz = gap + radius - height, 0, 0.0, 0.0, 0.0
+    for i in range(whole[3]):
+        px, py, pz = real[4 + 3 * i], real[5 + 3 * i], real[6 + 3 * i]
+        if px * ax + py * ay + pz * az < below:
+            count, sx, sy, sz = count + 1, sx + px, sy + py, sz + pz
+    if not count:
+        return
+    # All pull alike, so that their forces act as one at the sum of their arms.
+    x = turn[0] * sx + turn[1] * sy + turn[2] * sz + count * (cx - radius * nx - middle[0])
+    y = turn[3] * sx + turn[4] * sy + turn[5] * sz + count * (cy - radius * ny - middle[1])
+    z = turn[6] * sx + turn[7] * sy + turn[8] * sz + count * (cz - radius * nz - middle[2])
+    fx, fy, fz = -strength * nx, -strength * ny, -strength * nz
+    applied = state.xfrc_applied[whole[2]]
+    applied[0] += count * fx
+    applied[1] += count * fy
+    applied[2] += count * fz
+    applied[3] += y * fz - z * fy
+    applied[4] += z * fx - x * fz
+    applied[5] += x * fy - y * fx
+
+
+FIELD, BRAKE, DRAG, TURNING = range(4)
+"""Ways of a force on a body, see `concent_warp.effects.unknown_force.Way`."""
+
+
+@inlined
+def push_body_by_bump(begun: bool, whole: Numbers, real: Numbers, state: StepState) -> None:  # noqa: ARG001
+    """Act on a free body by one basis function, see `UnknownBodyForce`.
+
+    Args:
+        begun: Whether this is not the first step.
+        whole: Body, its place in positions and in velocities, way.
+        real: Center (3), one over the width, size (3), speed below which a resistance fades out.
+        state: MuJoCo's arrays.
+    """
+    body, place, dof, way = whole[0], whole[1], whole[2], whole[3]
+    first = dof + 3 if way == TURNING else dof
+    vx, vy, vz = state.qvel[first], state.qvel[first + 1], state.qvel[first + 2]
+    speed = math.sqrt(vx * vx + vy * vy + vz * vz)
+    if way in (FIELD, BRAKE):
+        x, y, z = state.qpos[place] - real[0], state.qpos[place + 1] - real[1], state.qpos[place + 2] - real[2]
+        square = (x * x + y * y + z * z) * real[3] * real[3]
+    else:
+        off = (speed - real[0]) * real[3]
+        square = off * off
+    bump = math.exp(-0.5 * square)
+    force = state.xfrc_applied[body]
+    if way == FIELD:
+        force[0] += bump * real[4]
+        force[1] += bump * real[5]
+        force[2] += bump * real[6]
+        return
+    size = bump * real[4] / math.sqrt(speed * speed + real[7] * real[7])
+    if way == TURNING:
+        state.qfrc_applied[first] -= size * vx
+        state.qfrc_applied[first + 1] -= size * vy
+        state.qfrc_applied[first + 2] -= size * vz
+    else:
+        force[0] -= size * vx
+        force[1] -= size * vy
+        force[2] -= size * vz
+
+
+FORCES = (add_stribeck, add_load, pass_play, drive_by_spring, push_by_bump, pull_to_plane, push_body_by_bump)
 """What may act, by the numbers that `act` knows them by."""
 
 
@@ -224,8 +316,12 @@ def act(begun: bool, whole: np.ndarray, real: np.ndarray, state: StepState) -> N
             pass_play(begun, indices, numbers, state)
         elif kind == 3:
             drive_by_spring(begun, indices, numbers, state)
-        else:
+        elif kind == 4:
             push_by_bump(begun, indices, numbers, state)
+        elif kind == 5:
+            pull_to_plane(begun, indices, numbers, state)
+        else:
+            push_body_by_bump(begun, indices, numbers, state)
 
 
 @compiled
@@ -247,6 +343,7 @@ def step(
         if k < len(ctrl):
             state.ctrl[:] = ctrl[k]
         state.qfrc_applied[:] = 0.0
+        state.xfrc_applied[:] = 0.0
         state.dof_frictionloss[:] = loss
         act(k > 0, whole, real, state)
         row = row_of[k]

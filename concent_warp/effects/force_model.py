@@ -29,7 +29,7 @@ class ForceModel:
     edits: ClassVar[tuple[str, ...]] = ()
     """Fields of the compiled model that it overwrites."""
 
-    acts: ClassVar[Callable[[bool, Numbers, Numbers, StepState], None] | None] = None
+    acts: Callable[[bool, Numbers, Numbers, StepState], None] | None = None
     """A function of `compiled_forces.FORCES`, which acts on one element by a row of numbers.
 
     Its arguments: whether this is not the first step, indices, numbers, and MuJoCo's arrays. None for force models that
@@ -65,7 +65,7 @@ class ForceModel:
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """Return `apply` for the steps of one simulation, in Python: constants are looked up once."""
-        act = type(self).acts
+        act = self.acts
         if act is None:
             return lambda: self.apply(m, d, values)
         state, rows = StepState.of(m, d), self.rows(m, values)

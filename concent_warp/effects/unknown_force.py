@@ -6,14 +6,12 @@ exp(-x^2 / 2) with x the distance from a centre in widths.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from typing import Literal
 
 import mujoco
 import numpy as np
 
-from concent_warp.effects.compiled_forces import Row, push_by_bump
+from concent_warp.effects.compiled_forces import Row, push_body_by_bump, push_by_bump
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.force_model import ForceModel
 
@@ -63,6 +61,8 @@ class UnknownJointForce(ForceModel):
 Way = Literal["field", "brake", "drag", "turning"]
 """How a force on a body acts: along each axis of the world by place; against the velocity by place, or by speed; as a
 torque against the turning by its rate."""
+WAYS: tuple[Way, ...] = ("field", "brake", "drag", "turning")
+"""The same, by their numbers in `concent_warp.effects.compiled_forces`."""
 
 
 class UnknownBodyForce(ForceModel):
@@ -70,6 +70,8 @@ class UnknownBodyForce(ForceModel):
 
     Parameters are the sizes of the basis functions over their scale, shape (K,), or (3 K,) along x, y and z of each.
     """
+
+    acts = staticmethod(push_body_by_bump)
 
     def __init__(
         self,
@@ -102,30 +104,17 @@ class UnknownBodyForce(ForceModel):
         """Number of parameters."""
         return len(self.centre) * (3 if self.way == "field" else 1)
 
-    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `ForceModel.bound`."""
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`."""
         del m
-        position, velocity = d.qpos[self.place : self.place + 3], d.qvel[self.dof : self.dof + 3]
-        rate, torque = d.qvel[self.dof + 3 : self.dof + 6], d.qfrc_applied[self.dof + 3 : self.dof + 6]
-        force = d.xfrc_applied[self.body, :3]
         sizes = np.reshape(values, (len(self.centre), -1)) * self.scale
-        used = np.flatnonzero((np.abs(sizes) > NEGLIGIBLE_SIZE).any(axis=1))
-        rows = [(self.centre[k], sizes[k]) for k in used]
-        narrow, way = 1.0 / self.width, self.way
-        fade_speed = 10 * self.fade_speed if way == "turning" else self.fade_speed
-
-        def act() -> None:
-            for centre, size in rows:
-                moved = rate if way == "turning" else velocity
-                speed = math.sqrt(float(moved @ moved))
-                off = (position - centre if way in ("field", "brake") else speed - centre) * narrow
-                bump = math.exp(-0.5 * float(off @ off))
-                if way == "field":
-                    force[:] += bump * size
-                    continue
-                (torque if way == "turning" else force)[:] -= bump * size[0] / math.hypot(speed, fade_speed) * moved
-
-        return act
+        fade_speed = 10 * self.fade_speed if self.way == "turning" else self.fade_speed
+        indices = [self.body, self.place, self.dof, WAYS.index(self.way)]
+        centre, size = (np.pad(a, ((0, 0), (0, 3 - a.shape[1]))) for a in (self.centre, sizes))
+        return [
+            (indices, [*centre[k].tolist(), 1.0 / self.width, *size[k].tolist(), fade_speed])
+            for k in np.flatnonzero((np.abs(sizes) > NEGLIGIBLE_SIZE).any(axis=1)).tolist()
+        ]
 
 
 class UnknownForce(Effect):

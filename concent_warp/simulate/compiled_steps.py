@@ -35,7 +35,7 @@ SHARE_OF_ARENA = 0.25
 
 def can_step(force_models: Sequence[tuple[ForceModel, np.ndarray]]) -> bool:
     """Return whether all of some force models, with their parameters, act as machine code."""
-    return can_compile() and all(type(force_model).acts in FORCES for force_model, _ in force_models)
+    return can_compile() and all(force_model.acts in FORCES for force_model, _ in force_models)
 
 
 def cannot_fill_arena(m: mujoco.MjModel) -> bool:
@@ -88,7 +88,7 @@ def step_compiled(
         qvel: Filled, shape (R, nv).
         sensordata: Filled, shape (R, nsensordata).
     """
-    kinds = [FORCES.index(type(force_model).acts) for force_model, _ in force_models]
+    kinds = [FORCES.index(force_model.acts) for force_model, _ in force_models]
     rows = [
         (kind, row)
         for kind, (force_model, values) in zip(kinds, force_models, strict=True)

@@ -6,7 +6,7 @@ import pytest
 
 from concent_warp.effects import compiled_forces
 from concent_warp.effects.registry import effect_class
-from concent_warp.effects.unknown_force import UnknownJointForce
+from concent_warp.effects.unknown_force import WAYS, UnknownBodyForce, UnknownJointForce
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate import mujoco_engine
@@ -85,6 +85,57 @@ def test_a_smooth_force_on_a_joint_acts_compiled_as_in_python(monkeypatch):
     compiled = engine.run(variants, np.zeros((1, STEPS, 2)), bodies=[])
     monkeypatch.setattr(mujoco_engine, "can_step", lambda _: False)
     python = engine.run(variants, np.zeros((1, STEPS, 2)), bodies=[])
+    np.testing.assert_array_equal(compiled.qpos, python.qpos)
+    assert np.abs(compiled.qpos[0, -1] - compiled.qpos[1, -1]).max() > 1e-3
+
+
+SLIDING = """<mujoco><option timestep=".002" cone="elliptic"/><worldbody>
+<geom type="plane" size="1 1 .1" zaxis=".1 0 1"/><geom type="plane" pos="-.08 0 0" size="1 1 .1" zaxis="1 0 0"/>
+<body name="block" pos="0 0 .055"><freejoint/>
+<geom type="box" size=".05 .04 .03" mass=".3"/><geom type="{shape}" pos=".02 0 .03" size=".02 .03 .02" mass=".1"/>
+</body></worldbody><sensor><framepos objtype="body" objname="block"/></sensor></mujoco>"""
+
+
+@pytest.mark.parametrize("shape", ["sphere", "capsule", "cylinder", "box"])
+def test_adhesion_to_planes_acts_compiled_as_in_python_to_the_last_bit(shape, monkeypatch):
+    model = Model(Scene(SLIDING.format(shape=shape)))
+    engine = MujocoEngine(model, threads=1)
+    force_model = effect_class("adhesion")("block").force_model(engine.compiled)
+    assert force_model is not None
+    values = np.array([[0.4], [0.0], [1.5]])
+    start = np.tile(engine.compiled.qpos0 + np.array([0, 0, 0, 0, 0.02, 0.1, 0]), (3, 1))
+    speed = np.tile([-0.4, 0.1, 0, 0.3, 0, 2.0], (3, 1))
+    variants = Variants(3, qpos=start, qvel=speed, force_models=((force_model, values),))
+    assert can_step([(force_model, values[0])])
+    compiled = engine.run(variants, np.zeros((1, STEPS, 0)), bodies=[])
+    monkeypatch.setattr(mujoco_engine, "can_step", lambda _: False)
+    python = engine.run(variants, np.zeros((1, STEPS, 0)), bodies=[])
+    for name in ("qpos", "qvel", "sensordata"):
+        np.testing.assert_array_equal(getattr(compiled, name), getattr(python, name))
+    # It holds the block back.
+    travelled = np.linalg.norm(compiled.qpos[:, -1, :3] - compiled.qpos[:, 0, :3], axis=1)
+    assert travelled[0] < 0.9 * travelled[1]
+
+
+def test_adhesion_to_a_box_is_not_compiled():
+    m = mujoco.MjModel.from_xml_string(SLIDING.format(shape="box").replace('type="plane" pos="-.08 0 0"', 'type="box"'))
+    force_model = effect_class("adhesion")("block").force_model(m)
+    assert force_model is not None
+    assert not can_step([(force_model, np.array([0.4]))])
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_smooth_force_on_a_body_acts_compiled_as_in_python(way, monkeypatch):
+    centre = np.array([[0.0, 0, 0.05], [0.05, 0.02, 0.05]]) if way in ("field", "brake") else np.array([[0.1], [0.4]])
+    engine = MujocoEngine(Model(Scene(SLIDING.format(shape="box"))), threads=1)
+    force_model = UnknownBodyForce(1, 0, 0, centre, 0.1, 2.0, way)
+    values = np.array([np.linspace(0.2, 0.4, force_model.count), np.zeros(force_model.count)])
+    speed = np.tile([0.4, 0.1, 0, 0.3, 0, 2.0], (2, 1))
+    variants = Variants(2, qvel=speed, force_models=((force_model, values),))
+    assert can_step([(force_model, values[0])])
+    compiled = engine.run(variants, np.zeros((1, STEPS, 0)), bodies=[])
+    monkeypatch.setattr(mujoco_engine, "can_step", lambda _: False)
+    python = engine.run(variants, np.zeros((1, STEPS, 0)), bodies=[])
     np.testing.assert_array_equal(compiled.qpos, python.qpos)
     assert np.abs(compiled.qpos[0, -1] - compiled.qpos[1, -1]).max() > 1e-3
 

@@ -19,6 +19,7 @@ from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, le
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
+from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import finer_time_step, renew_defects
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
@@ -67,9 +68,13 @@ class Additions:
             if finer is not None and not is_lacking(finer, factors, cfg):
                 fitted = self._adopt(fitted, finer)
                 break
+            bounded, before = None, record.time_step
             if not effects_alone and (found := self._with_nominal(fitted, finer, first)) is not None:
-                fitted = found
-                continue
+                if step >= cfg.max_additions or not self._is_at_bounds(found[-1]):
+                    fitted = found
+                    continue
+                # Something larger may be missing: an effect that explains more comes first.
+                bounded, record.time_step, before = found, before, record.time_step
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
             if step and self._is_futile(fitted[-1]):
@@ -84,9 +89,15 @@ class Additions:
                 best, smallest = self.finder.find(fitted[-1], step, explained=adequate)
             except TimeUpError:
                 context.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
+                if bounded is not None:
+                    fitted, record.time_step = bounded, before
                 break
             detectable = detectable or smallest
             equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
+            if bounded is not None and (best is None or not leaves_more(bounded[-1].errors, best.errors, cfg.search)):
+                record.forget(*recorded)
+                fitted, record.time_step = bounded, before
+                continue
             if finer is not None and finer.errors.sum() <= equal:
                 record.forget(*recorded)
                 fitted = self._adopt(fitted, finer)
@@ -102,6 +113,10 @@ class Additions:
                 break
             fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
         return fitted, detectable
+
+    def _is_at_bounds(self, one: FittedModel) -> bool:
+        """Return whether nominal values of a model are at their bounds, and more than noise is left."""
+        return one.ratio > self.context.cfg.nominal.bounded_ratio and has_bounded_nominal_values(one.model)
 
     def _is_futile(self, one: FittedModel) -> bool:
         """Return whether no further effect could be accepted: down to the noise, less is left than it must remove."""

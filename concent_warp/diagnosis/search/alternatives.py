@@ -13,7 +13,9 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import leaves_more, surprise
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.additions import Additions
+from concent_warp.diagnosis.search.adequacy import discrepancies
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.diagnosis.search.record import SearchRecord
 
@@ -21,9 +23,9 @@ from concent_warp.diagnosis.search.record import SearchRecord
 def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[FittedModel]:
     """Return the fitted models of the search from another first effect, where that leads to a more plausible answer.
 
-    Answers count that explain as much as the best, or leave little more than noise: what one with more parameters
-    explains beyond that is weighed by their number. An answer that the data cannot distinguish from the best, and that
-    differs by one effect, adds that to the group of the one in whose place it stands.
+    Answers count that explain as much as the best, or leave no more than noise or errors in formulas: what one explains
+    beyond that is weighed by its parameters, sizes and rarity. An answer that the data cannot distinguish from the
+    best, and that differs by one effect, adds that to the group of the one in whose place it stands.
 
     Args:
         additions: The search; its record is that of the returned models afterwards.
@@ -53,14 +55,40 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
     equal = [
         (found, recorded)
         for found, recorded in answers
-        if not leaves_more(found[-1].errors, least.errors, cfg.search) or found[-1].ratio <= cfg.search.explained_ratio
+        if not leaves_more(found[-1].errors, least.errors, cfg.search)
+        or found[-1].ratio <= cfg.search.explained_ratio
+        or context.is_form_error(found[-1], first, recorded)
     ]
     equal.sort(key=lambda answer: -plausibility(answer[0][-1]))
     best, context.record = equal[0]
+    formulas = context.is_form_error(best[-1], first)
     for other, of_other in equal[1:]:
-        if plausibility(other[-1]) > plausibility(best[-1]) - 2 * np.log(cfg.search.max_odds):
+        errors = formulas and context.is_form_error(other[-1], first, of_other)
+        if log_odds(other[-1], best[-1], first if errors else None, cfg) > -2 * np.log(cfg.search.max_odds):
             _add_to_group(context.record, of_other, other[-1])
     return best
+
+
+def log_odds(other: FittedModel, best: FittedModel, first: FittedModel | None, cfg: DiagnoseCfg) -> float:
+    """Return twice the log posterior odds of another answer against the best one.
+
+    Where both leave no more than errors in their formulas, how much either leaves is little evidence: errors of
+    formulas are systematic, the same in all blocks of time, and of unknown size. With a scale-invariant prior of that
+    size the odds are then those of what is left, and not that to the power of the number of blocks.
+
+    Args:
+        other: Last fitted model of the other answer.
+        best: That of the best one.
+        first: The model as given where both leave no more than errors in their formulas, else None.
+        cfg: Settings.
+    """
+    odds = plausibility(other) - plausibility(best)
+    if first is None:
+        return odds
+    by_blocks = best.blocks.count * float(np.log(best.errors.sum() / max(other.errors.sum(), 1e-12)))
+    # What counts as noise still may be left by either.
+    less, more = (max(discrepancies(one, first)[0], cfg.min_gain) for one in (best, other))
+    return odds - by_blocks + max(by_blocks, 2 * float(np.log(less / more)))
 
 
 def _add_to_group(record: SearchRecord, other: SearchRecord, last: FittedModel) -> None:
@@ -75,8 +103,8 @@ def _add_to_group(record: SearchRecord, other: SearchRecord, last: FittedModel) 
     ours, theirs = sorted(steps.keys() - names.keys()), sorted(names.keys() - steps.keys())
     if len(ours) == len(theirs) == 1 and theirs[0] not in record.groups[steps[ours[0]]]:
         step = steps[ours[0]]
-        record.groups[step] = (*record.groups[step], theirs[0])
-        record.hypotheses[step] = {**record.hypotheses[step], theirs[0]: last.model}
+        record.equals[step] = {**record.equals.get(step, {}), theirs[0]: last.model}
+        record.add_equals(step)
 
 
 def _from(additions: Additions, first: FittedModel, rival: Rival) -> list[FittedModel]:

@@ -60,13 +60,18 @@ class SearchContext:
         near = one.ratio <= self.cfg.form_error_ratio
         return self.cfg.min_gain if near else max(self.cfg.min_gain, self.cfg.search.far_min_gain)
 
-    def is_form_error(self, one: FittedModel, first: FittedModel) -> bool:
+    def is_form_error(self, one: FittedModel, first: FittedModel, record: SearchRecord | None = None) -> bool:
         """Return whether a model with added effects leaves no more than errors in their formulas.
 
         Little is then left beside the discrepancy of the first model, and little beside the noise.
+
+        Args:
+            one: The fitted model.
+            first: The model as given.
+            record: What the search that led to the model has found; by default that of this context.
         """
         left, lacked = discrepancies(one, first)
-        share = self.cfg.max_form_error if self.record.form_corrected else self.cfg.unknown_force.min_share
+        share = self.cfg.max_form_error if (record or self.record).form_corrected else self.cfg.unknown_force.min_share
         return left < share * lacked and one.ratio <= self.cfg.form_error_ratio
 
     def explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:

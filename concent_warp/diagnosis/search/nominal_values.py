@@ -59,6 +59,17 @@ def nominal_effects(model: Model) -> list[int]:
     return [i for i, added in enumerate(model.effects) if added.effect.nominal]
 
 
+def has_bounded_nominal_values(model: Model) -> bool:
+    """Return whether a nominal value of a model is at its bound."""
+    plain = replace(model, effects=()).compile()
+    return any(
+        FittedParameter.within(p, value, 0.0).at_bound
+        for added in model.effects
+        if added.effect.nominal
+        for p, value in zip(added.effect.parameters(plain), added.values, strict=True)
+    )
+
+
 def without_nominal_values(last: FittedModel) -> FittedModel:
     """Return the fitted model with its nominal values as given, all that is left fitted again."""
     dropped = nominal_effects(last.model)

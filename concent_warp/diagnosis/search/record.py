@@ -31,6 +31,8 @@ class SearchRecord:
     """Additions whose profile likelihood is not evaluated: the model that each was added to, and its fit."""
     rivals: dict[int, tuple[Rival, ...]] = field(default_factory=dict)
     """Candidates that explained nearly as much as each addition, and that one itself."""
+    equals: dict[int, dict[str, Model]] = field(default_factory=dict)
+    """Effects of other answers that the data cannot distinguish from this one, in the place of each addition."""
     time_step: FinerTimeStep | None = None
     nominal_values: tuple[FittedParameter, ...] = ()
     provisional: int | None = None
@@ -71,6 +73,12 @@ class SearchRecord:
             for f in sorted(rest, key=lambda f: -f.gain)
         ]
 
+    def add_equals(self, step: int) -> None:
+        """Add to the group of an addition what other answers have in its place, see `equals`."""
+        more = {n: model for n, model in self.equals.get(step, {}).items() if n not in self.groups[step]}
+        self.groups[step] = (*self.groups[step], *more)
+        self.hypotheses[step] = {**self.hypotheses[step], **more}
+
     def refuse(self, refused: Callable[[Finding], bool], reason: str) -> None:
         """Refuse those of the accepted effects that a condition holds for."""
         self.findings = [
@@ -102,6 +110,7 @@ class SearchRecord:
         step, best = old.step, group[0][1]
         self.groups[step] = tuple(f.name for _, f in group)
         self.hypotheses[step] = {f.name: c.model for c, f in group}
+        self.add_equals(step)
         if best.name != old.name:
             self.widening[step] = np.ones(len(best.parameters))
             self.unprofiled.pop(step, None)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from concent_warp.effects.compiled_forces import Row, pull_to_plane
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.select import static_geoms
 
@@ -107,7 +108,28 @@ class AdhesionForce(ForceModel):
         """Whether the geom's first size is a radius about the point, shape (P,)."""
         flat = np.isin(m.geom_type, [GEOM.mjGEOM_PLANE, GEOM.mjGEOM_BOX]) & colliding
         self.still = np.intersect1d(static_geoms(m), np.flatnonzero(flat)).astype(np.int32)
+        if np.all(m.geom_type[self.still] == GEOM.mjGEOM_PLANE):
+            self.acts = pull_to_plane
         self._device: tuple[wp.array[Any], wp.array[Any], wp.array[Any], wp.array[Any]] | None = None
+
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`; a row for each geom and plane."""
+        strength = float(values[0])
+        if strength <= 0:
+            return []
+        found: list[Row] = []
+        for g in np.unique(self.geom).tolist():
+            points, radius, reach = self._points(m, g)
+            numbers = [strength, self.gap, radius, reach, *points.ravel().tolist()]
+            found += [([g, plane, int(m.geom_bodyid[g]), len(points)], numbers) for plane in self.still.tolist()]
+        return found
+
+    def _points(self, m: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float, float]:
+        """Return the points of a geom in its frame [m], shape (P, 3), its radius and how far it reaches [m]."""
+        mine = self.geom == geom
+        radius = float(m.geom_size[geom, 0]) if self.round[mine][0] else 0.0
+        points = self.point[mine].astype(float)
+        return points, radius, float(np.linalg.norm(points, axis=1).max()) + radius + self.gap
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """See `ForceModel.bound`."""
@@ -116,10 +138,7 @@ class AdhesionForce(ForceModel):
             return lambda: None
         parts = []
         for g in np.unique(self.geom):
-            mine = self.geom == g
-            radius = float(m.geom_size[g, 0]) if self.round[mine][0] else 0.0
-            points = self.point[mine].astype(float)
-            reach = float(np.linalg.norm(points, axis=1).max()) + radius + self.gap
+            points, radius, reach = self._points(m, g)
             body = m.geom_bodyid[g]
             pose = d.geom_xpos[g], d.geom_xmat[g]
             parts.append((*pose, points, points.tolist(), radius, reach, d.xipos[body], d.xfrc_applied[body]))
@@ -136,8 +155,8 @@ class AdhesionForce(ForceModel):
                 return
             if len(planes) < len(flat):  # poses of what stands still are known from the first step on
                 for g in flat:
-                    normal = d.geom_xmat[g].reshape(3, 3)[:, 2]
-                    planes.append((*normal.tolist(), float(d.geom_xpos[g] @ normal)))
+                    (nx, ny, nz), (x, y, z) = d.geom_xmat[g, 2::3].tolist(), d.geom_xpos[g].tolist()
+                    planes.append((nx, ny, nz, x * nx + y * ny + z * nz))
             for centre, turn, points, listed, radius, reach, middle, applied in parts:
                 # A handful of points: plain numbers are several times faster than arrays of them.
                 cx, cy, cz = centre.tolist()

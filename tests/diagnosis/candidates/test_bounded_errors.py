@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.candidates.baseline import fit_baseline, held_out_errors, refit_without_effect
+from concent_warp.diagnosis.candidates.screening import screen
+from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values
 from concent_warp.effects.effect import AddedEffect
+from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.effects.library.joints import JointDamping, JointFriction
+from concent_warp.effects.library.nominal import NominalGain
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, cut_blocks
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
@@ -17,6 +21,7 @@ from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
+from tests.scenes.swinging import swing_scene, swung
 
 XML = """
 <mujoco><option timestep="0.002"/><worldbody><body name="arm"><joint name="hinge" type="hinge" axis="0 1 0"
@@ -70,6 +75,20 @@ def test_what_is_at_a_bound_leaves_the_other_parameters_as_they_are():
     alone = Sums(given.normal[:, 1:, 1:], given.slope[:, 1:], given.square)
     found = held_out_errors(replace(bare, effects=added), given, blocks(), 10.0)
     assert found == pytest.approx(HeldOut(alone, blocks(), 10.0).own())
+
+
+def test_a_candidate_promises_nothing_that_a_nominal_value_beyond_its_bound_would_explain():
+    """The servo is weaker than the model's: its gain is at the end of its tolerance, and would move on alone."""
+    recording = swung(damping=0.0)
+    model = Model(Scene(swing_scene(kp=1.1))).add(NominalGain("servo"))
+    windows = observe(model, recording)
+    base = fit_baseline(model, windows, cut_blocks(windows))
+    assert base.model.effects[0].values == pytest.approx((0.98,))
+    assert has_bounded_nominal_values(base.model)
+    assert not has_bounded_nominal_values(model)
+    assert base.ratio > 3
+    assert screen(base, ActuatorGain("servo")).expected_gain > 0.9
+    assert screen(base, JointFriction("hinge")).expected_gain < 0.1
 
 
 def test_an_effect_at_its_null_value_gains_nothing_over_the_model_without_it():

@@ -8,6 +8,7 @@ import pytest
 from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.search import additions, context
 from concent_warp.diagnosis.search.adequacy import is_lacking
+from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.made_up import FINER, GIVEN, finding, node, procedure
 
 
@@ -145,6 +146,66 @@ def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of
     made.additions._with_nominal([given, after], None, given)
     # 5.2 % and 9.3 % of the discrepancy.
     assert asked == [None, [True, False]]
+
+
+@pytest.mark.parametrize(
+    ("bounded_errors", "bounded_ratio", "at_bounds", "effect_errors", "asked", "left"),
+    [
+        (40.0, 1.5, True, 20.0, 1, "effect"),
+        (40.0, 1.5, True, 39.5, 1, "values"),  # the effect explains no more than may be chance
+        (40.0, 1.5, True, None, 1, "values"),
+        (40.0, 1.5, False, 20.0, 0, "values"),
+        (40.0, 1.05, True, 20.0, 0, "values"),  # little more than noise is left
+    ],
+)
+def test_an_effect_that_explains_more_comes_before_nominal_values_at_their_bounds(
+    monkeypatch, bounded_errors, bounded_ratio, at_bounds, effect_errors, asked, left
+):
+    given, after = node(9.0, 900.0), node(2.5, 100.0, effects=1)
+    bounded, second = (
+        node(bounded_ratio, bounded_errors, effects=1, nominal=1),
+        node(1.0, effect_errors or 1, effects=2),
+    )
+    made, calls = procedure(max_additions=2), []
+
+    def find(base, step, **_):
+        calls.append((base, step))
+        found = None if base is bounded or effect_errors is None else second
+        if found is not None:
+            made.record.groups.append(("second",))
+            made.record.findings.append(finding("second", 0.6, step=step))
+        return found, ()
+
+    # With a shorter time step, too.
+    finer = node(2.4, 95.0, effects=1, timestep=FINER)
+    monkeypatch.setattr(made.additions.finder, "find", find)
+    monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg: finer if one is after else None)
+    monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
+    monkeypatch.setattr(additions, "has_bounded_nominal_values", lambda model: at_bounds and model is bounded.model)
+    monkeypatch.setattr(context, "with_nominal_values", lambda one, *_: bounded if one is finer else None)
+    fitted, _ = made.additions.add_effects([given, after], ())
+    assert [base for base, _ in calls].count(after) == asked
+    assert fitted == ([given, after, second] if left == "effect" else [given, bounded])
+    assert made.record.groups == ([("second",)] if left == "effect" else [])
+    assert len(made.record.findings) == (left == "effect")
+    assert made.record.time_step == (None if left == "effect" else "found")
+
+
+def test_nominal_values_at_their_bounds_stay_where_there_is_no_time_to_look_for_an_effect(monkeypatch):
+    given, after, bounded = node(9.0, 900.0), node(2.5, 100.0, effects=1), node(1.5, 40.0, effects=1, nominal=1)
+    made = procedure()
+
+    def late(*_, **__):
+        raise TimeUpError
+
+    monkeypatch.setattr(made.additions.finder, "find", late)
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(additions, "has_bounded_nominal_values", lambda _: True)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: bounded)
+    assert made.additions.add_effects([given, after], ()) == ([given, bounded], ())
+    assert made.context.budget.cut == {1}
 
 
 def test_far_from_the_noise_a_shorter_time_step_must_explain_a_fifth(monkeypatch):

@@ -20,7 +20,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis, Finding, FinerTimeStep
 from concent_warp.diagnosis.search import alternatives as module
-from concent_warp.diagnosis.search.alternatives import _from, plausibility, try_alternatives
+from concent_warp.diagnosis.search.alternatives import _from, log_odds, plausibility, try_alternatives
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.library.joints import JointDamping
@@ -110,8 +110,8 @@ def test_an_alternative_that_leaves_more_changes_nothing(greedy, monkeypatch):
 
 
 def test_beyond_the_noise_the_plausible_answer_counts_and_not_the_one_that_leaves_least(greedy, monkeypatch):
-    # The other answer leaves 10 % more. Its plausibility decides where that is little more than noise.
-    for ratio, plausible, taken in ((1.05, 5.0, True), (1.05, -5.0, False), (1.2, 5.0, False)):
+    # The other answer leaves 10 % more. Its plausibility decides where that may be an error in formulas.
+    for ratio, plausible, taken in ((1.05, 5.0, True), (1.05, -5.0, False), (1.2, 5.0, True), (2.1, 5.0, False)):
         made, fitted = resumed(greedy, 1), greedy[1]
         other = replace(fitted[-1], errors=1.1 * fitted[-1].errors)
         monkeypatch.setattr(FittedModel, "ratio", property(lambda one, o=other, r=ratio: r if one is o else 1.0))
@@ -261,6 +261,21 @@ def test_nominal_values_cost_what_they_are_off_and_nothing_for_their_number(base
     assert plausibility(at(gain, null)) == pytest.approx(same)
     prior = gain.cfg.least_squares.prior
     assert plausibility(at(gain, null)) - plausibility(at(gain, null + 2 * scale)) == pytest.approx(4 / prior**2)
+
+
+def test_of_errors_in_formulas_the_amounts_count_once_and_not_once_a_block(base, monkeypatch):
+    damped, cfg = added(base, JointDamping("hinge")), DiagnoseCfg()
+    other = replace(damped, errors=1.2 * damped.errors)
+    by_blocks = -base.blocks.count * np.log(1.2)
+    assert log_odds(other, damped, None, cfg) == pytest.approx(by_blocks)
+    for left, odds in (((0.4, 0.2), 2 * np.log(0.5)), ((0.2, 0.01), 2 * np.log(0.25)), ((9.0, 0.0), by_blocks)):
+        others, best = left
+        monkeypatch.setattr(module, "discrepancies", lambda one, _, a=others, b=best: (b if one is damped else a, 8.0))
+        assert log_odds(other, damped, base, cfg) == pytest.approx(max(odds, by_blocks))
+        # The rest of what makes an answer plausible counts as before.
+        assert log_odds(at(other, 0.5), damped, base, cfg) - log_odds(at(other, 0.0), damped, base, cfg) == (
+            pytest.approx(plausibility(at(other, 0.5)) - plausibility(at(other, 0.0)))
+        )
 
 
 def settled(greedy: tuple[Procedure, list[FittedModel]], monkeypatch, answer: FittedModel, odds: float) -> Any:

@@ -16,7 +16,7 @@ def test_a_copy_of_a_record_has_all_of_it_and_does_not_change_with_it():
     rivals, time_step, values, models, unprofiled = made_up
     record = SearchRecord(
         [finding("a", 0.5)], [("a",)], [{"a": MODEL}], {0: np.ones(1)}, unprofiled, {0: rivals},
-        time_step, values, 1, True, models,
+        {0: {"b": MODEL}}, time_step, values, 1, True, models,
     )  # fmt: skip
     assert all(getattr(record, f.name) for f in fields(SearchRecord))
     copied = record.copy()
@@ -42,3 +42,13 @@ def test_an_effect_that_takes_the_place_of_an_accepted_one_is_recorded_once():
     assert [(f.name, f.accepted) for f in record.findings] == [("a", False), ("b", True)]
     assert (record.groups, record.hypotheses) == ([("b",)], [{"b": MODEL}])
     assert record.accepted() == [new]
+
+
+def test_what_another_answer_has_in_the_place_of_an_effect_stays_in_its_group_beside_what_is_exchanged():
+    old, new = finding("a", 0.5), finding("b", 0.6)
+    better: Any = type("Candidate", (), {"model": MODEL})()
+    for equal, group in (("c", ("b", "c")), ("b", ("b",))):
+        record = SearchRecord([old], [("a",)], [{}], {0: np.full(1, 3.0)}, equals={0: {equal: MODEL}})
+        record.exchange(old, [(better, new)])
+        assert record.groups == [group]
+        assert list(record.hypotheses[0]) == list(group)
