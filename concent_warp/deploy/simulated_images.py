@@ -33,7 +33,7 @@ from concent_warp.train.task.task import Task
 
 PATTERNS = 8
 """Patterns of a world, among which its geoms are divided."""
-VARIED = ("geom_rgba", "cam_pos", "cam_quat", "light_pos", "light_dir", "light_diffuse", "light_ambient")
+VARIED = ("geom_rgba", "geom_size", "cam_pos", "cam_quat", "light_pos", "light_dir", "light_diffuse", "light_ambient")
 """Fields of the model that differ between worlds."""
 HEADLIGHT = {"ambient": [0.1] * 3, "diffuse": [0.15] * 3, "specular": [0.1] * 3}
 """Light from the camera itself, the same in all worlds."""
@@ -75,6 +75,9 @@ class RandomisedImages:
         self._fields = {name: self._stage.field(name) for name in VARIED}
         self._nominal = {name: value.clone() for name, value in self._fields.items()}
         self._body_of = torch.as_tensor(model.geom_bodyid, dtype=torch.int32, device=device)
+        names = {task.compiled.body(body).name for body in task.objects}
+        of_objects = [[float(model.body(body).name in names)] for body in model.geom_bodyid]
+        self._of_objects = torch.tensor(of_objects, device=device)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._middle = torch.as_tensor(data.xpos[list(task.objects)].mean(axis=0), dtype=torch.float32, device=device)
@@ -119,6 +122,7 @@ class RandomisedImages:
         nominal = self._nominal
         return [
             self._colours(nominal["geom_rgba"]),
+            nominal["geom_size"] * (1 + cfg.size * self._signed(*nominal["geom_size"].shape) * self._of_objects),
             nominal["cam_pos"] + cfg.camera_position * self._signed(*nominal["cam_pos"].shape),
             multiply_quaternions(
                 nominal["cam_quat"],

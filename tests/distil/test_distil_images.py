@@ -20,7 +20,7 @@ SIZE = 32
 IMAGES = cw.ImagesCfg(size=SIZE, samples=1, shadows=False)
 STILL = cw.LooksCfg(
     colour=0.0, hue_share=0.0, pattern=0.0, grain_share=0.0, light_elevation=(60.0, 60.0), light_strength=(0.5, 0.5),
-    light_tint=0.0, ambient=(0.1, 0.1), camera_position=0.0, camera_angle=0.0,
+    light_tint=0.0, ambient=(0.1, 0.1), camera_position=0.0, camera_angle=0.0, size=0.0,
 )  # fmt: skip
 """Looks of which only the direction of the lights varies."""
 ALL = torch.ones(2, dtype=torch.bool)
@@ -82,6 +82,30 @@ def test_patterns_change_the_brightness_of_surfaces_by_their_contrast(environmen
     assert ratio.max() < 2.1
     # A pattern is grey: it changes the colours alike.
     assert np.abs(ratio - ratio.mean(axis=1, keepdims=True)).max() < 0.15
+
+
+def test_objects_are_drawn_in_other_sizes_and_nothing_else_is(environment):
+    images = []
+    for size in (0.0, 0.4):
+        source = RandomisedImages(environment.task, 2, IMAGES, replace(STILL, size=size), "cpu")
+        torch.manual_seed(3)
+        source.begin(ALL)
+        light = source.state()
+        for name in ("light_pos", "light_dir", "background"):  # the same for both worlds
+            light[name] = light[name][:1].expand_as(light[name]).clone()
+        source.restore(light)
+        images.append(seen(source, environment)[:, BASE])
+    alike, other = (np.abs(one[0] - one[1]).max(axis=0) > 20 for one in images)
+    assert not alike.any()
+    assert 0 < other.sum() < 0.05 * SIZE**2
+
+
+def test_stripes_run_in_one_direction(environment):
+    source = RandomisedImages(environment.task, 2, IMAGES, replace(STILL, pattern=1.0, stripe_share=1.0), "cpu")
+    source.begin(ALL)
+    waves = source.state()["waves"][..., :3]
+    across = torch.linalg.cross(waves, waves[:, :, :1].expand_as(waves))
+    assert float(across.abs().max()) < 1e-3 * float(waves.square().sum(dim=-1).max())
 
 
 def test_grains_have_their_size(environment):
