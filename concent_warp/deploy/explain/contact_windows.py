@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.deploy.explain.cfg import ContactStartCfg, WindowsCfg
 from concent_warp.deploy.explain.grasp_fit import GraspFit
-from concent_warp.deploy.explain.measured_start import SINGLE, MeasuredStart, joint_positions
+from concent_warp.deploy.explain.measured_start import SINGLE, HandFrame, MeasuredStart, joint_positions
 from concent_warp.deploy.explain.replay_trial import TrialReadings, fixture_fields
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration
@@ -165,13 +165,12 @@ class WindowSimulation:
         frames = readings.pose
         qpos, qvel = np.tile(start.qpos, (len(times), 1)), np.zeros((len(times), m.nv))
         read = joint_positions(m, demonstration, readings.time)[:, address]
-        hands = _hands(m, self._task.robot.tool, joint_positions(m, demonstration, frames.time))
+        hands = HandFrame(m, self._task.robot.tool, demonstration).at(frames.time)
         place = slice(self._address, self._address + 7)
         for k, time in enumerate(times):
             qpos[k, address], qvel[k, dof] = _local_line(readings.time, read, time, cfg.smoothing)
-            near = np.abs(frames.time - time) <= cfg.smoothing
-            if near.sum() < 3:
-                near = np.argsort(np.abs(frames.time - time))[:3]
+            away = np.abs(frames.time - time)
+            near = away <= max(cfg.smoothing, float(np.sort(away)[:3][-1]))
             data.qpos[:], data.qvel[:] = qpos[k], qvel[k]
             mujoco.mj_kinematics(m, data)
             mujoco.mj_comPos(m, data)
@@ -199,17 +198,6 @@ def _collides(model: Model, task: Task) -> bool:
     collides = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
     names = [task.compiled.body(body).name for body in task.objects]
     return all(bool((collides & (m.geom_bodyid == m.body(name).id)).any()) for name in names)
-
-
-def _hands(m: mujoco.MjModel, site: int, qpos: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """Return positions (T, 3) and orientations of a site at positions of the joints (T, nq)."""
-    data = mujoco.MjData(m)
-    place, turn = np.zeros((len(qpos), 3)), np.zeros((len(qpos), 3, 3))
-    for row, one in enumerate(qpos):
-        data.qpos[:] = one
-        mujoco.mj_kinematics(m, data)
-        place[row], turn[row] = data.site_xpos[site], data.site_xmat[site].reshape(3, 3)
-    return place, Rotation.from_matrix(turn)
 
 
 def _local_line(time: np.ndarray, value: np.ndarray, at: float, width: float) -> tuple[np.ndarray, np.ndarray]:
