@@ -45,22 +45,22 @@ many episodes as it takes to have six failed trials, at most 96; the effect is s
 trial failed, the case says nothing. *All together* is the verdict from six failed trials and four successful ones,
 *one by one* that of single trials, given the others.
 
-47 of 60 cases were begun and ended on a machine with 16 cores that was held for half an hour; 13, among them the policies
-with noise and the short trainings, were not. A diagnosis had 600 s of one slow processor. Those of these cases searched in
-two whole trials, contacts included; the present version searches in the robot's free motion where this differs. Tried
-since, in the free motion of eight trials, on two cores beside much other work: `gravity_compensation=0.2` and
-`joint_friction=3` with other seeds, both named rightly after 600 and 357 s; `joint_friction=3` and
-`stribeck_friction=4`, unsettled after 600 s of a quarter of a core.
+47 of 60 cases were begun and ended on a machine with 16 cores that was held for half an hour; 13, among them the
+policies with noise and the short trainings, were not. A diagnosis had 600 s of one slow processor. Those of these
+cases searched in two whole trials, contacts included; the present version searches in the robot's free motion where
+this differs. Tried since, in the free motion of eight trials, on two cores beside much other work:
+`gravity_compensation=0.2` and `joint_friction=3` with other seeds, both named rightly after 600 and 357 s;
+`joint_friction=3` and `stribeck_friction=4`, unsettled after 600 s of a quarter of a core.
 
-Errors of poses were searched for by replays of whole trials then. Some of the cases were measured again with the search
-that is there now, on less than half a core beside other work: first those of perception that had been named wrongly, and
-a few of each other cause, in an order that was fixed before; every case that was begun counts. Their seeds and magnitudes
-are those of the first measurement, and others were used for development. A diagnosis had 60 s then (`--seconds 60`): it
-names no effect in so short a time, and is not needed to say that the physics differ.
+Errors of poses were searched for by replays of whole trials then. Some of the cases were measured again with the
+search that is there now, on less than half a core beside other work: first those of perception that had been named
+wrongly, and a few of each other cause, in an order that was fixed before; every case that was begun counts. Their
+seeds and magnitudes are those of the first measurement, and others were used for development. A diagnosis had 60 s
+then (`--seconds 60`): it names no effect in so short a time, and is not needed to say that the physics differ.
 
 What the figures do not show: other tasks and robots; two causes at once; errors of poses that differ from trial to
-trial; trials without tracked poses; scenes whose shapes are wrong, since Reality's are those of the scene with chamfered
-edges.
+trial; trials without tracked poses; scenes whose shapes are wrong, since Reality's are those of the scene with
+chamfered edges.
 """
 
 
