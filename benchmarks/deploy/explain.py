@@ -53,10 +53,11 @@ this differs. Tried since, in the free motion of eight trials, on two cores besi
 `joint_friction=3` and `stribeck_friction=4`, unsettled after 600 s of a quarter of a core.
 
 Errors of poses were searched for by replays of whole trials then. Some of the cases were measured again with the
-search that is there now, on less than half a core beside other work: first those of perception that had been named
-wrongly, and a few of each other cause, in an order that was fixed before; every case that was begun counts. Their
-seeds and magnitudes are those of the first measurement, and others were used for development. A diagnosis had 60 s
-then (`--seconds 60`): it names no effect in so short a time, and is not needed to say that the physics differ.
+search that is there now, on less than half a core beside other work: all of perception that had been named wrongly,
+and a few that had been named rightly, of each cause, as long as there was time; every case that was begun counts.
+What had been right and was not measured again could be wrong now. Seeds and magnitudes are those of the first
+measurement; others were used for development. A diagnosis had 60 s then (`--seconds 60`): it names no effect in so
+short a time, and is not needed to say that the physics differ.
 
 Tried in development, with other seeds: of two turns about the axis of the fingers (0.135 and 0.16 rad) neither was
 found, since the object pivots in the grasp; a block that is 4 % larger (`--hide size=1.04`) and pads that slip
