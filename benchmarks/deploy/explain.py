@@ -31,8 +31,10 @@ from concent_warp.simulate.parallel import limit_simulations
 from concent_warp.train.trials.evaluate import wilson
 
 NAME = "explain"
-METHOD = "windows"
-"""How an error of tracked poses is searched for. Rows of another method are measured again; those before had none."""
+METHOD = "windows, small errors preferred"
+"""How an error of tracked poses is searched for. Rows of another method are measured again; the first ones had none."""
+METHODS = ("windows", METHOD)
+"""Methods that differ little from it."""
 SEED = 400
 """First seed of the trials; other ones were used for development."""
 INTRODUCTION = """\
@@ -58,6 +60,10 @@ and a few that had been named rightly, of each cause, as long as there was time;
 What had been right and was not measured again could be wrong now. Seeds and magnitudes are those of the first
 measurement; others were used for development. A diagnosis had 60 s then (`--seconds 60`): it names no effect in so
 short a time, and is not needed to say that the physics differ.
+
+In one of them, shift 9, nothing was touched, so that all errors above some size explained as much; a far too large
+one was taken, and the verdict was policy. The search has preferred small errors since. This case was measured again
+with that, as were those that are listed below the first table; the others were not.
 
 Tried in development, with other seeds: of two turns about the axis of the fingers (0.135 and 0.16 rad) neither was
 found, since the object pivots in the grasp; a block that is 4 % larger (`--hide size=1.04`) and pads that slip
@@ -120,7 +126,7 @@ def main(args: Args) -> None:
 def first_rows(path: Path) -> dict[str, dict[str, Any]]:
     """Return the rows of cases that were measured before by another method."""
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return {row["key"]: row for row in reversed(rows) if row.get("method") != METHOD and "error" not in row}
+    return {row["key"]: row for row in reversed(rows) if row.get("method") not in METHODS and "error" not in row}
 
 
 def study(case: Case, seed: int, args: Args) -> dict[str, Any]:
@@ -176,7 +182,7 @@ def page(rows: Mapping[str, Mapping[str, Any]], earlier: Mapping[str, Mapping[st
     """
     earlier = earlier or {}
     judged = {name: row for name, row in rows.items() if row["found"] is not None}
-    now = [row for row in judged.values() if row.get("method") == METHOD]
+    now = [row for row in judged.values() if row.get("method") in METHODS]
     summary, compared, detail = [], [], []
     for cause in ("perception", "physics", "policy", "all"):
         mine = [row for row in judged.values() if cause in (row["cause"], "all")]
@@ -192,11 +198,12 @@ def page(rows: Mapping[str, Mapping[str, Any]], earlier: Mapping[str, Mapping[st
         bias = row.get("bias")
         shift = "" if bias is None else " ".join(f"{1e3 * v:+.1f}" for v in bias[:3])
         counts = f"{sum(one == row['cause'] for one in row.get('one by one', []))} of {len(row.get('one by one', []))}"
-        before = "" if row.get("method") != METHOD else earlier.get(name, {}).get("found", "")
+        before = "" if row.get("method") not in METHODS else earlier.get(name, {}).get("found", "")
         detail.append(
             [name, row["cause"], row["found"] or "no trial failed", before, counts, found, shift,
              f"{row['failed']} of {row['episodes']}", f"{row.get('seconds', 0):.0f}"]
         )  # fmt: skip
+    newest = ", ".join(name for name, row in judged.items() if row.get("method") == METHOD) or "none"
     head = ["cause", "all together", "95 %", "one by one", "95 %"]
     columns = [
         "case",
@@ -214,7 +221,7 @@ def page(rows: Mapping[str, Mapping[str, Any]], earlier: Mapping[str, Mapping[st
     parts = [
         "# Why trials failed", "Written by `benchmarks/deploy/explain.py`; do not edit.", INTRODUCTION,
         machines(rows), "## Causes named rightly", "Cases measured with the present search for errors of poses:",
-        table([*head, "the same cases before"], compared),
+        table([*head, "the same cases before"], compared), f"Those with the preference for small errors: {newest}.",
         "All cases, each by its latest row, so those of the search before where none is of the present one:",
         table(head, summary), effects, "## Cases",
         "A case with an entry under *before* is of the present search, and that is what the one before found.",

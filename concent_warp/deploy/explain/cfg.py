@@ -80,6 +80,9 @@ class PoseBiasCfg:
     """Iterations on all of them, from what the halves show."""
     least_units: Count = 6
     """Pieces of evidence that gains are tested on, at least: trials, or parts of them where they are fewer."""
+    prior: tuple[float, float] = (0.05, 1.0)
+    """Standard deviations of errors before anything is known [m], [rad], wide: the squares of errors over these are
+    added to the loss, so that of errors that explain as much, as where nothing is touched, the smallest is taken."""
     floor: tuple[float, float] = (3e-4, 5e-3)
     """Smallest standard deviations of samples [m], [rad]: no smaller error is distinguished."""
 

@@ -129,12 +129,12 @@ class PoseBiasSearch:
         """Return the error (6,) of the least mean loss, and the standard deviation of the best samples (6,)."""
         cfg, rng = self._cfg, np.random.default_rng(self._seed)
         floor, std = np.repeat(cfg.floor, 3), np.repeat((cfg.position, cfg.orientation), 3)
-        cost = self._losses(units, guesses).mean(axis=1)
+        cost = self._cost(units, guesses)
         best = mean = guesses[cost.argmin()]
         lowest = float(cost.min())
         for k in range(iterations):
             samples = np.concatenate([mean[None], mean + std * rng.normal(size=(cfg.samples, 6))])
-            cost = self._losses(units, samples).mean(axis=1)
+            cost = self._cost(units, samples)
             order = np.argsort(cost)
             if cost[order[0]] < lowest:
                 best, lowest = samples[order[0]], float(cost[order[0]])
@@ -142,6 +142,11 @@ class PoseBiasSearch:
             mean, std = elite.mean(axis=0), np.maximum(elite.std(axis=0), floor)
             progress((k + 1) / iterations)
         return best, std
+
+    def _cost(self, units: Sequence[TrialWindows], bias: np.ndarray) -> np.ndarray:
+        """Return the mean loss under errors (N, 6), larger for large errors, shape (N,)."""
+        prior = np.square(bias / np.repeat(self._cfg.prior, 3)).sum(axis=1)
+        return self._losses(units, bias).mean(axis=1) + prior
 
     def _losses(self, trials: Sequence[TrialWindows], bias: np.ndarray) -> np.ndarray:
         """Return the mean loss of the windows of T trials under errors (N, 6), shape (N, T)."""
