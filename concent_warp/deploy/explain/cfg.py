@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Count, OpenShare, Positive, PositiveDuration, Share
+from concent_warp.checks import Bounds, Count, Duration, OpenShare, Positive, PositiveDuration, Share
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,35 @@ class ContactStartCfg:
     """The same of an orientation [rad]."""
     iterations: int = 4
     """Iterations of Powell's method."""
+    grasp_iterations: Count = 4
+    """Iterations in which an object is fitted between the fingers."""
+
+
+@dataclass(frozen=True)
+class WindowsCfg:
+    """Short simulations from measured states, by which an error of tracked poses is judged.
+
+    The tolerances are about the errors that windows of trials without an error of the poses have.
+    """
+
+    length: PositiveDuration = 0.2
+    """Length of a window [s]: a few time constants of a servo under load."""
+    spacing: PositiveDuration = 0.2
+    """Least time between the beginnings of windows [s]."""
+    most: Count = 6
+    """Most windows of a trial."""
+    smoothing: PositiveDuration = 0.1
+    """Time on either side of a beginning over which readings are averaged there [s]."""
+    settling: Duration = 0.04
+    """Time from a beginning from which on joints are compared [s]."""
+    joints: Positive = 4.0
+    """Tolerance of joints in units of their noise [-]."""
+    position: Positive = 1e-3
+    """Tolerance of the mean position of the object in a window [m]."""
+    orientation: Positive = 0.02
+    """Tolerance of its mean orientation [rad]."""
+    diverged: Positive = 8.0
+    """Loss of a window that diverges [-]."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +66,6 @@ class PoseBiasCfg:
     """Errors along each axis, to both sides, of which the best is the first guess [m]."""
     orientations: tuple[float, ...] = (0.06, 0.12, 0.2)
     """The same about each axis [rad]."""
-    scanned: Count = 2
-    """Trials that first guesses are judged by."""
     position: float = 2.5e-3
     """Standard deviation of the first samples about the first guess [m]."""
     orientation: float = 0.03
@@ -48,9 +75,14 @@ class PoseBiasCfg:
     elite: Count = 6
     """Samples of the smallest misfit, from which the next ones are taken."""
     iterations: Count = 6
-    """Iterations."""
-    trials: Count = 3
-    """Most trials that it is fitted to."""
+    """Iterations on each half of the trials."""
+    last_iterations: Count = 3
+    """Iterations on all of them, from what the halves show."""
+    least_units: Count = 6
+    """Pieces of evidence that gains are tested on, at least: trials, or parts of them where they are fewer."""
+    prior: tuple[float, float] = (0.05, 1.0)
+    """Standard deviations of errors before anything is known [m], [rad], wide: the squares of errors over these are
+    added to the loss, so that of errors that explain as much, as where nothing is touched, the smallest is taken."""
     floor: tuple[float, float] = (3e-4, 5e-3)
     """Smallest standard deviations of samples [m], [rad]: no smaller error is distinguished."""
 
@@ -73,12 +105,18 @@ class JudgeCfg:
     free_ratio: Positive = 2.0
     """Joint errors in free motion over the 95 % quantile of simulated trials from which on they are physical [-]."""
     explained: Share = 0.5
-    """Share of the misfit above that of simulated trials that a cause must explain [-]."""
+    """Share of the misfit above that of simulated trials that a missing effect must explain [-]."""
+    least_gain: Share = 0.15
+    """Share of the loss of short windows that an error of tracked poses must remove in trials that it was not fitted
+    to, and of a single trial [-]."""
+    least_bias: Positive = 3.0
+    """Size of an error of tracked poses over the tracker's noise, along or about one axis, from which on it is a cause
+    [-]: policies are trained for smaller ones."""
     weak_policy: Share = 0.7
     """Success rate in the policy's own simulation up to which the policy is the cause [-]."""
     credible_start: Positive = 2.0
     """Misfit up to which measured starts are credible [-]; noise alone leaves about 1. Where the policy fails in
-    simulation from starts with more, an error of the tracked poses is searched for first."""
+    simulation from such starts, no error of the tracked poses is searched for."""
     at_limit: Share = 0.95
     """Share of a limit of commands from which on it counts as reached [-]."""
 
@@ -122,5 +160,7 @@ class ExplainCfg:
     """Judgement of the evidence."""
     start: ContactStartCfg = field(default_factory=ContactStartCfg)
     """Starts of trials that measurement and contact agree on."""
+    windows: WindowsCfg = field(default_factory=WindowsCfg)
+    """Short simulations by which such an error is judged."""
     bias: PoseBiasCfg = field(default_factory=PoseBiasCfg)
     """Search for a constant error of tracked poses."""

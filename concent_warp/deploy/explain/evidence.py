@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from concent_warp.deploy.explain.cfg import JudgeCfg
+from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.own_simulation import SimulatedTrials
 from concent_warp.deploy.explain.policy_evidence import limits_reached, unusual_observations
 from concent_warp.deploy.explain.pose_bias import PoseBias
@@ -58,6 +59,8 @@ class Evidence:
     """Largest difference of logged actions from those of the policy, asked again [-]; None without a log."""
     bias: PoseBias | None = None
     """The error of tracked poses that explains most."""
+    starts: tuple[MeasuredStart, ...] = ()
+    """Starts of the trials without it, where it was accepted."""
     diagnosis: Diagnosis | None = None
     misfit_with_effect: np.ndarray | None = None
     """Misfit with the missing effect, shape (T,)."""
@@ -91,17 +94,15 @@ class Judge:
         found = mannwhitneyu(evidence.misfit, evidence.usual, alternative="greater")
         return larger and bool(found.pvalue <= self._cfg.significance)
 
-    def doubts_starts(self, evidence: Evidence) -> bool:
-        """Return whether the policy fails in its own simulation from starts that the replays contradict."""
-        weak = evidence.own.rate <= self._cfg.weak_policy
-        return weak and float(np.median(evidence.misfit)) > self._cfg.credible_start
+    def doubts_poses(self, evidence: Evidence) -> bool:
+        """Return whether an error of the tracked poses may be behind the trials.
 
-    def corrects_starts(self, evidence: Evidence) -> bool:
-        """Return whether an error of tracked poses explains the misfit of doubtful starts, above that of noise."""
-        if evidence.bias is None:
-            return False
-        excess = np.maximum(evidence.misfit - 1.0, 1e-9)
-        return bool(np.median((evidence.misfit - evidence.bias.after) / excess) >= self._cfg.explained)
+        It is not where joints differ before anything is touched, nor where the policy fails in its own simulation from
+        starts that the replays agree with.
+        """
+        weak = evidence.own.rate <= self._cfg.weak_policy
+        credible = float(np.median(evidence.misfit)) <= self._cfg.credible_start
+        return not self.moves_otherwise(evidence) and not (weak and credible)
 
     def moves_otherwise(self, evidence: Evidence) -> bool:
         """Return whether the robot's joints differ in free motion."""
@@ -111,10 +112,12 @@ class Judge:
         return bool(np.median(real) > self._cfg.free_ratio * np.quantile(usual, QUANTILE))
 
     def is_perception(self, evidence: Evidence) -> bool:
-        """Return whether an error of tracked poses explains the trials."""
-        if evidence.bias is None:
+        """Return whether there is an error of tracked poses, beyond the tracker's usual ones, in all trials."""
+        bias = evidence.bias
+        if bias is None:
             return False
-        return bool(np.median(evidence.explained(evidence.bias.after)) >= self._cfg.explained)
+        sure = bias.p <= self._cfg.significance and bias.held_out >= self._cfg.least_gain
+        return bool(sure and bias.size >= self._cfg.least_bias)
 
     def is_perception_by_diagnosis(self, evidence: Evidence) -> bool:
         """Return whether the diagnosis names an error of the instruments."""
@@ -134,9 +137,11 @@ class Judge:
         """Return the cause that all trials together show."""
         if evidence.own.rate <= self._cfg.weak_policy:
             return "policy"
+        if self.is_perception(evidence):
+            return "perception"
         if not self.differs(evidence):
             return "unexplained"
-        if self.is_perception(evidence) or self.is_perception_by_diagnosis(evidence):
+        if self.is_perception_by_diagnosis(evidence):
             return "perception"
         return "physics" if self.is_physics(evidence) else "unexplained"
 
@@ -168,7 +173,9 @@ class Judge:
             "misfit that agrees": self.limit(evidence),
             "free joint error": _median(evidence.free),
             "free joint error of simulated trials": _median(evidence.usual_free),
-            "explained by perception": None if bias is None else float(np.median(evidence.explained(bias.after))),
+            "explained by perception": None if bias is None else float(np.median(bias.explained)),
+            "held-out gain of the error of poses": None if bias is None else bias.held_out,
+            "p of the error of poses": None if bias is None else bias.p,
             "explained by physics": None if effect is None else float(np.median(evidence.explained(effect))),
             "held-out gain of the effect": None if (named := _named(evidence)) is None else named.gain,
         }
@@ -185,7 +192,7 @@ class Judge:
         if self.moves_otherwise(evidence):
             said.append(free_motion_sentence(numbers))
         if cause == "perception" and evidence.bias is not None and self.is_perception(evidence):
-            said.append(bias_sentence(evidence.bias, numbers["explained by perception"]))
+            said.append(bias_sentence(evidence.bias))
         if evidence.diagnosis is not None:
             said += diagnosis_sentences(evidence.diagnosis, numbers["explained by physics"])
         if evidence.with_cause is not None and cause in ("perception", "physics"):
@@ -199,19 +206,17 @@ class Judge:
         """Return the judgement of one trial, given the cause that all show together."""
         trial, numbers = evidence.trials[k], self._trial_numbers(evidence, k)
         own: Cause = "unexplained"
+        limit = self.limit(evidence)
         if float(evidence.own.success[k].mean()) <= self._cfg.weak_policy:
             own = "policy"
-        elif (numbers.get(f"explained by {cause}") or 0.0) >= self._cfg.explained and (
-            evidence.misfit[k] > self._cfg.least_ratio * evidence.level
-        ):
+        elif cause == "perception" and (numbers["explained by perception"] or 0.0) >= self._cfg.least_gain:
             own = cause
-        elif evidence.misfit[k] > self.limit(evidence):
-            shares = {name: numbers[f"explained by {name}"] or 0.0 for name in ("perception", "physics")}
-            best = max(shares, key=lambda name: shares[name])
-            if shares[best] >= self._cfg.explained:
-                own = "perception" if best == "perception" else "physics"
-            elif cause in ("physics", "perception"):
-                own = cause  # what all trials show together; contacts may have gone another way in this replay
+        elif (numbers["explained by physics"] or 0.0) >= self._cfg.explained and (
+            evidence.misfit[k] > (self._cfg.least_ratio * evidence.level if cause == "physics" else limit)
+        ):
+            own = "physics"
+        elif evidence.misfit[k] > limit and cause in ("physics", "perception"):
+            own = cause  # what all trials show together; contacts may have gone another way in this replay
         usual = np.concatenate(list(evidence.usual_windows) or [np.ones(1)])
         threshold = float(max(np.quantile(usual, 0.99), self._cfg.least_ratio))
         above = np.flatnonzero(evidence.windows[k] > threshold)
@@ -242,7 +247,7 @@ class Judge:
             "misfit": float(evidence.misfit[k]),
             "free joint error": free if np.isfinite(free) else None,
             "move of the start, mm": float(1e3 * np.linalg.norm(trial.move[:3])),
-            "explained by perception": None if bias is None else float(evidence.explained(bias.after)[k]),
+            "explained by perception": None if bias is None else float(bias.explained[k]),
             "explained by physics": None if effect is None else float(evidence.explained(effect)[k]),
             **limits_reached(self._task, trial.demonstration, joints, self._cfg.at_limit),
             "unusual observations": unusual_observations(self._policy, trial.demonstration),

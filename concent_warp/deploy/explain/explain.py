@@ -11,11 +11,12 @@ import numpy as np
 
 from concent_warp.checks import check_settings
 from concent_warp.deploy.explain.cfg import ExplainCfg
+from concent_warp.deploy.explain.contact_windows import WindowSimulation
 from concent_warp.deploy.explain.evidence import Evidence, Judge
 from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
 from concent_warp.deploy.explain.policy_evidence import other_action
-from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, corrected, fit_pose_bias
+from concent_warp.deploy.explain.pose_bias import PoseBias, PoseBiasSearch, corrected
 from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
 from concent_warp.deploy.explain.replay_trial import Replayer
 from concent_warp.deploy.explain.result import Explanation
@@ -122,14 +123,11 @@ class _Explaining:
         progress(0.2, "replaying simulated trials")
         evidence = self._measured(trials, others, own)
         judge = Judge(self._policy, self._own.task, cfg.judge)
-        if judge.doubts_starts(evidence):
-            evidence = self._from_corrected_starts(evidence, judge, trials, others)
-        if judge.differs(evidence):
-            if evidence.bias is None:
-                evidence = self._with_bias(evidence)
-            if cfg.diagnose and not judge.is_perception(evidence):
-                evidence = self._with_diagnosis(evidence, judge, others)
-            evidence = self._with_cause_in_simulation(evidence, judge)
+        if judge.doubts_poses(evidence):
+            evidence = self._with_bias(evidence, judge, trials, others)
+        if judge.differs(evidence) and cfg.diagnose and not judge.is_perception(evidence):
+            evidence = self._with_diagnosis(evidence, judge, others)
+        evidence = self._with_cause_in_simulation(evidence, judge)
         progress(1.0, "done")
         total = sum(len(r.demonstrations) for r in self._recordings)
         return judge.explanation(evidence, [r.source for r, _ in self._chosen], self._failed, total)
@@ -173,40 +171,29 @@ class _Explaining:
         found = [other_action(act, size, t.demonstration) for t in trials]
         return max((one for one in found if one is not None), default=None)
 
-    def _with_bias(self, evidence: Evidence) -> Evidence:
-        """Search for an error of tracked poses, and see how much of all trials' misfit it explains."""
-        cfg, contact, replayer = self._cfg, self._preparation.contact, self._preparation.replayer
-        every = [TrialToFit(t.demonstration, t.readings, t.measured) for t in evidence.trials]
-        text = "searching for an error of the tracked poses"
-        self._progress(0.25, text)
-        bias = fit_pose_bias(
-            every,
-            replayer,
-            contact,
-            evidence.joint_scale,
-            cfg.bias,
-            seed=cfg.seed,
-            progress=lambda share: self._progress(0.25 + 0.2 * share, text),
-        )
-        return replace(evidence, bias=bias)
-
-    def _from_corrected_starts(
+    def _with_bias(
         self, evidence: Evidence, judge: Judge, trials: list[PreparedTrial], others: list[PreparedTrial]
     ) -> Evidence:
-        """Return the evidence with the own simulation from starts without an error of the tracked poses.
+        """Search for an error of the tracked poses; if there is one, ask the simulation again from corrected starts.
 
-        A policy that is shown in the hand what is not there fails in simulation as well, without being weak. Where no
-        error explains the misfit, the evidence stays.
+        A policy that is shown in the hand what is not there fails in simulation as well, without being weak.
         """
-        evidence = self._with_bias(evidence)
-        bias = evidence.bias
-        assert bias is not None
-        if not judge.corrects_starts(evidence):
-            return replace(evidence, bias=None)
+        cfg, address = self._cfg, self._preparation.contact.address
+        text = "searching for an error of the tracked poses"
+        self._progress(0.25, text)
+        simulation = WindowSimulation(self._policy.run.model, self._own.task, cfg.windows, cfg.start)
+        every = [simulation.windows(t.demonstration, t.readings, t.measured) for t in (*trials, *others)]
+        bias = PoseBiasSearch(simulation, cfg.bias, seed=cfg.seed).run(
+            every, lambda share: self._progress(0.25 + 0.2 * share, text)
+        )
+        evidence = replace(evidence, bias=bias.of_first(len(trials)))
+        if not judge.is_perception(evidence):
+            return evidence
         self._progress(0.45, "asking the policy's own simulation from corrected starts")
-        moved = [corrected(t.measured, self._preparation.contact.address, bias.value) for t in others]
-        found = self._measured(trials, others, self._simulate([*bias.starts, *moved], 0.45, 0.5))
-        return replace(found, bias=bias)
+        moved = [corrected(t.measured, address, bias.value) for t in (*trials, *others)]
+        starts = [self._preparation.contact.settled(start)[0] for start in moved]
+        found = self._measured(trials, others, self._simulate(starts, 0.45, 0.5))
+        return replace(found, bias=evidence.bias, starts=tuple(starts[: len(trials)]))
 
     def _with_diagnosis(self, evidence: Evidence, judge: Judge, others: Sequence[PreparedTrial]) -> Evidence:
         """Search for a missing effect in failed trials, and see how much of all trials' misfit it explains."""
@@ -258,15 +245,13 @@ class _Explaining:
     def _with_cause_in_simulation(self, evidence: Evidence, judge: Judge) -> Evidence:
         """Put the cause into the policy's own simulation: does it fail there as well?"""
         self._progress(0.9, "trying the cause in the policy's own simulation")
-        starts = [t.start for t in evidence.trials]
         if judge.is_perception(evidence) and (bias := evidence.bias) is not None:
-            true_starts = list(bias.starts)
-            fair = self._simulate(true_starts, 0.9, 0.95)
-            sensors = self._biased(bias)
-            return replace(evidence, own=fair, with_cause=self._simulate(true_starts, 0.95, 1.0, sensors=sensors))
+            biased = self._simulate(evidence.starts, 0.95, 1.0, sensors=self._biased(bias))
+            return replace(evidence, with_cause=biased)
         diagnosis = evidence.diagnosis
         if diagnosis is None or not diagnosis.accepted:
             return evidence
+        starts = [t.start for t in evidence.trials]
         try:
             return replace(evidence, with_cause=self._simulate(starts, 0.9, 1.0, model=_added(self._policy, diagnosis)))
         except ConcentError:  # training supports no such effect

@@ -110,12 +110,7 @@ class Replayer:
         qpos = np.tile(start.qpos, (count, 1))
         address = int(m.jnt_qposadr[m.body_jntadr[self._task.objects[0]]])
         qpos[:, address : address + 7] = poses
-        fields = {}
-        if start.fixtures:
-            place, turn = m.body_pos.copy(), m.body_quat.copy()
-            for name, pose in start.fixtures.items():
-                place[m.body(name).id], turn[m.body(name).id] = pose[:3], pose[3:]
-            fields = {"body_pos": np.tile(place, (count, 1, 1)), "body_quat": np.tile(turn, (count, 1, 1))}
+        fields = fixture_fields(m, start, count)
         body = m.body(self._task.objects[0]).name
         found = engine.run(
             Variants(count, qpos=qpos, qvel=np.zeros((count, m.nv)), fields=fields), ctrl, bodies=(body,)
@@ -125,6 +120,16 @@ class Replayer:
         place = np.stack([interpolate(found.time, p[:, 0], readings.pose.time) for p in found.body_position])
         turn = found.body_quaternion[:, np.round(readings.pose.time / dt).astype(int).clip(0, len(found.time) - 1), 0]
         return ReplayedTrials(joints, place, turn, found.diverged)
+
+
+def fixture_fields(m: mujoco.MjModel, start: MeasuredStart, count: int) -> dict[str, np.ndarray]:
+    """Return the fields of N variants of a model whose fixed objects stand where a start has them."""
+    if not start.fixtures:
+        return {}
+    place, turn = m.body_pos.copy(), m.body_quat.copy()
+    for name, pose in start.fixtures.items():
+        place[m.body(name).id], turn[m.body(name).id] = pose[:3], pose[3:]
+    return {"body_pos": np.tile(place, (count, 1, 1)), "body_quat": np.tile(turn, (count, 1, 1))}
 
 
 def model_with_effects(model: Model, other: Model) -> Model:
