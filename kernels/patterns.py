@@ -31,6 +31,7 @@ def paint_patterns_kernel(
     camera_position: wp.array2d(dtype=wp.vec3),
     camera_matrix: wp.array2d(dtype=wp.mat33),
     body_of: wp.array(dtype=int),
+    whole: wp.array(dtype=int),
     body_position: wp.array2d(dtype=wp.vec3),
     body_quaternion: wp.array2d(dtype=wp.quat),
     waves: wp.array3d(dtype=wp.vec4),
@@ -52,6 +53,7 @@ def paint_patterns_kernel(
         camera_position: Positions of all cameras [m], shape (W, ncam).
         camera_matrix: Their orientations, shape (W, ncam).
         body_of: Body of each geom, shape (ngeom,).
+        whole: The geom whose pattern each one has, shape (ngeom,).
         body_position: Origins of bodies [m], shape (W, nbody).
         body_quaternion: Their orientations, wxyz, shape (W, nbody).
         waves: Wave vectors [rad/m] and phases of the patterns, shape (W, P, WAVES); geom g has pattern g % P.
@@ -80,7 +82,7 @@ def paint_patterns_kernel(
         # Stored as wxyz, while Warp's quaternions are xyzw.
         turn = wp.quat(q[1], q[2], q[3], q[0])
         local = wp.quat_rotate_inv(turn, point - body_position[world, body])
-        pattern = geom % contrast.shape[1]
+        pattern = whole[geom] % contrast.shape[1]
         level = float(0.0)  # noqa: UP018  (a constant cannot change in a loop)
         for k in range(wp.static(WAVES)):
             wave = waves[world, pattern, k]

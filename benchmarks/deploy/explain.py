@@ -230,9 +230,10 @@ def page(
     ]
     effects = f"Of {len(named)} cases of changed physics the missing effect is named first in {sum(named)} "
     effects += f"({_shares(named)[1]}), and is among those that the data cannot distinguish in {sum(grouped)}."
+    measured = {**rows, **{f"{name} effects": row for name, row in (searched or {}).items()}}
     parts = [
         "# Why trials failed", "Written by `benchmarks/deploy/explain.py`; do not edit.", INTRODUCTION,
-        machines(rows | {f"{name} effects": row for name, row in (searched or {}).items()}), "## Causes named rightly", "Cases measured with the present search for errors of poses:",
+        machines(measured), "## Causes named rightly", "Cases measured with the present search for errors of poses:",
         table([*head, "the same cases before"], compared), f"Those with the preference for small errors: {newest}.",
         "All cases, each by its latest row, so those of the search before where none is of the present one:",
         table(head, summary), "## Missing effects", effects,

@@ -14,6 +14,7 @@ import torch
 import warp as wp
 
 from concent_warp.deploy.cfg import splat_files
+from concent_warp.deploy.cut_edges import CutEdges, add_parts, cut_edges
 from concent_warp.errors import RenderError
 from concent_warp.kernels.patterns import WAVES, paint_patterns
 from concent_warp.model import Model
@@ -35,6 +36,8 @@ PATTERNS = 8
 """Patterns of a world, among which its geoms are divided."""
 VARIED = ("geom_rgba", "geom_size", "cam_pos", "cam_quat", "light_pos", "light_dir", "light_diffuse", "light_ambient")
 """Fields of the model that differ between worlds."""
+SLIMMEST = 0.5
+"""Least size of a geom whose edges are cut [its size]."""
 HEADLIGHT = {"ambient": [0.1] * 3, "diffuse": [0.15] * 3, "specular": [0.1] * 3}
 """Light from the camera itself, the same in all worlds."""
 
@@ -67,7 +70,8 @@ class RandomisedImages:
             RenderError: The scene has no such camera.
         """
         self.cameras, self.size, self._looks = images.cameras, images.size, looks
-        model = _lit_model(task.model, images, looks.lights)
+        objects = [task.compiled.body(body).name for body in task.objects]
+        model, edges = _lit_model(task.model, images, looks.lights, objects)
         self._stage = PosedWorlds(model, worlds, varied=VARIED, device=_warp_name(device))
         self._camera = RawCamera(
             self._stage, images.cameras, (images.size, images.size), shadows=images.shadows, samples=images.samples
@@ -75,9 +79,10 @@ class RandomisedImages:
         self._fields = {name: self._stage.field(name) for name in VARIED}
         self._nominal = {name: value.clone() for name, value in self._fields.items()}
         self._body_of = torch.as_tensor(model.geom_bodyid, dtype=torch.int32, device=device)
-        names = {task.compiled.body(body).name for body in task.objects}
-        of_objects = [[float(model.body(body).name in names)] for body in model.geom_bodyid]
+        of_objects = [[float(model.body(body).name in objects)] for body in model.geom_bodyid]
         self._of_objects = torch.tensor(of_objects, device=device)
+        self._whole = torch.as_tensor(edges.whole, dtype=torch.int32, device=device)
+        self._shortened = torch.as_tensor(edges.shortened, dtype=torch.float32, device=device)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._middle = torch.as_tensor(data.xpos[list(task.objects)].mean(axis=0), dtype=torch.float32, device=device)
@@ -122,7 +127,7 @@ class RandomisedImages:
         nominal = self._nominal
         return [
             self._colours(nominal["geom_rgba"]),
-            nominal["geom_size"] * (1 + cfg.size * self._signed(*nominal["geom_size"].shape) * self._of_objects),
+            self._sizes(nominal["geom_size"]),
             nominal["cam_pos"] + cfg.camera_position * self._signed(*nominal["cam_pos"].shape),
             multiply_quaternions(
                 nominal["cam_quat"],
@@ -143,6 +148,14 @@ class RandomisedImages:
         replaced = self._uniform((0.0, 1.0), self._worlds, self._bodies, 1) < cfg.hue_share
         moved = (nominal[..., :3] + change[:, bodies]).clamp(0, 1)
         return torch.cat([torch.where(replaced[:, bodies], other[:, bodies], moved), nominal[..., 3:]], dim=-1)
+
+    def _sizes(self, nominal: torch.Tensor) -> torch.Tensor:
+        """Return sizes of the geoms, those of the objects changed and their edges cut, shape (N, ngeom, 3)."""
+        cfg = self._looks
+        changed = nominal * (1 + cfg.size * self._signed(*nominal.shape) * self._of_objects)
+        cut = self._uniform(cfg.chamfer, self._worlds, 1, 1) * self._shortened
+        whole = changed[:, self._whole.long()]
+        return torch.maximum(whole - cut, SLIMMEST * whole)
 
     def _lamps(self, count: int) -> list[torch.Tensor]:
         """Return positions, directions, light and ambient light of the lamps, shape (N, lamps, 3) each."""
@@ -194,7 +207,8 @@ class RandomisedImages:
             inputs = [
                 wp.from_torch(seen.rgb, dtype=wp.vec3), wp.from_torch(seen.depth), wp.from_torch(seen.segmentation),
                 wp.array(camera_ids(model, self.cameras), dtype=int), wp.array(focal, dtype=float),
-                data.cam_xpos, data.cam_xmat, wp.from_torch(self._body_of), data.xpos, data.xquat,
+                data.cam_xpos, data.cam_xmat, wp.from_torch(self._body_of), wp.from_torch(self._whole),
+                data.xpos, data.xquat,
                 wp.from_torch(self._waves, dtype=wp.vec4), wp.from_torch(self._contrast),
                 wp.from_torch(self._grain, dtype=wp.vec3),
                 wp.from_torch(self._background, dtype=wp.vec3),
@@ -265,8 +279,8 @@ def base_fovy(images: ImagesCfg, have: Sequence[str]) -> dict[str, float]:
     return {BASE: images.base_fovy} if BASE in images.cameras and BASE not in have else {}
 
 
-def _lit_model(model: Model, images: ImagesCfg, lamps: int) -> mujoco.MjModel:
-    """Return a scene with the student's cameras, its lights replaced by lamps, compiled."""
+def _lit_model(model: Model, images: ImagesCfg, lamps: int, objects: Sequence[str]) -> tuple[mujoco.MjModel, CutEdges]:
+    """Return a scene with the student's cameras, its lights replaced by lamps, compiled; and parts of its objects."""
     spec = Model(with_cameras(model.scene, images.cameras), model.geometry).spec()
     for name, angle in base_fovy(images, [camera.name for camera in model.scene.spec().cameras]).items():
         spec.camera(name).fovy = angle
@@ -278,7 +292,9 @@ def _lit_model(model: Model, images: ImagesCfg, lamps: int) -> mujoco.MjModel:
         )
     for name, value in HEADLIGHT.items():
         setattr(spec.visual.headlight, name, value)
-    return spec.compile()
+    parts = add_parts(spec, objects)
+    compiled = spec.compile()
+    return compiled, cut_edges(compiled, parts)
 
 
 def _warp_name(device: str) -> str:

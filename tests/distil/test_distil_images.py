@@ -20,7 +20,7 @@ SIZE = 32
 IMAGES = cw.ImagesCfg(size=SIZE, samples=1, shadows=False)
 STILL = cw.LooksCfg(
     colour=0.0, hue_share=0.0, pattern=0.0, grain_share=0.0, light_elevation=(60.0, 60.0), light_strength=(0.5, 0.5),
-    light_tint=0.0, ambient=(0.1, 0.1), camera_position=0.0, camera_angle=0.0, size=0.0,
+    light_tint=0.0, ambient=(0.1, 0.1), camera_position=0.0, camera_angle=0.0, size=0.0, chamfer=(0.0, 0.0),
 )  # fmt: skip
 """Looks of which only the direction of the lights varies."""
 ALL = torch.ones(2, dtype=torch.bool)
@@ -84,10 +84,11 @@ def test_patterns_change_the_brightness_of_surfaces_by_their_contrast(environmen
     assert np.abs(ratio - ratio.mean(axis=1, keepdims=True)).max() < 0.15
 
 
-def test_objects_are_drawn_in_other_sizes_and_nothing_else_is(environment):
+@pytest.mark.parametrize("looks", [{"size": 0.4}, {"chamfer": (0.0, 0.015)}])
+def test_objects_are_drawn_in_other_shapes_and_nothing_else_is(environment, looks):
     images = []
-    for size in (0.0, 0.4):
-        source = RandomisedImages(environment.task, 2, IMAGES, replace(STILL, size=size), "cpu")
+    for one in (STILL, replace(STILL, **looks)):
+        source = RandomisedImages(environment.task, 2, IMAGES, one, "cpu")
         torch.manual_seed(3)
         source.begin(ALL)
         light = source.state()

@@ -87,8 +87,11 @@ class LooksCfg:
     grain_length: PositiveInterval = (0.002, 0.05)
     """Range of the edge of a cell, log-uniform [m]."""
     size: Annotated[float, Bounds(0, 0.9)] = 0.05
-    """Largest relative change of the drawn size of a geom of the objects along each of its axes [-]: real edges are
-    rounded, and a millimetre of the block's outline is a millimetre of its pose. Meshes keep their size."""
+    """Largest relative change of the drawn size of a geom of the objects along each of its axes [-]; meshes keep
+    theirs."""
+    chamfer: Interval = (0.0, 0.003)
+    """Range of the width of the cuts along the edges of objects that are a box or a cylinder [m]: real edges are not
+    sharp, and a student of sharp ones takes cut ones for another pose."""
     lights: Annotated[int, Bounds(1, 16)] = 2
     """Lamps, in place of those of the scene; the first casts shadows."""
     light_elevation: Annotated[tuple[float, float], Bounds(0, 90, ascending=True)] = (30.0, 85.0)
