@@ -85,7 +85,7 @@ WRONG = {
     "distil": (
         "--device cuda:7", "--images.cameras ceiling", "--images.cameras base base", "--images.networks gone",
         "--images.splats block", "--images.delay 2 1", "--network.channels 12", "--network.hidden", "--iterations 0",
-        "--worlds 1000000000", "--dagger.label guess", "--size 4",
+        "--worlds 1000000000", "--dagger.label guess", "--size 4", "--begin-with gone", "--looks.chamfer 0.002 0.001",
     ),
     "evaluate": (
         "--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",

@@ -67,6 +67,22 @@ def test_a_distillation_that_stopped_continues_exactly(teacher, student, tmp_pat
     assert [point["iteration"] for point in read_curve(out)] == [1, 2, 3]
 
 
+def test_a_distillation_begins_with_another_student_and_keeps_its_statistics(teacher, student):
+    larger = replace(TINY, images=replace(TINY.images, size=2 * TINY.images.size))
+    still = replace(larger, dagger=replace(TINY.dagger, iterations=1, learning_rate=1e-12, decay=0.0))
+    begun = cw.distil(teacher, still, begin_with=student, device="cpu")
+    assert begun.weights["iteration"] == 1
+    for name, value in student.weights["student"].items():
+        assert torch.allclose(begun.weights["student"][name], value, atol=1e-5), name
+
+
+def test_a_student_of_another_network_is_none_to_begin_with(teacher, student, tmp_path):
+    wider = replace(TINY, network=replace(TINY.network, keypoints=2 * TINY.network.keypoints))
+    with pytest.raises(TrainError, match="the student to begin with"):
+        cw.distil(teacher, wider, begin_with=student, device="cpu", out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_distillation_of_rsl_rl_is_a_baseline_that_resumes(teacher, tmp_path):
     cfg = replace(TINY, method="rsl_rl", dagger=replace(TINY.dagger, iterations=2))
     whole = cw.distil(teacher, cfg, device="cpu")

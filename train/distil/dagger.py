@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -362,7 +362,7 @@ class Dagger:
         assert self.folder is not None
         return self.folder / f"samples_{self.process.rank}_{iteration}.bin"
 
-    def begin_with(self, weights: dict[str, Any], where: object = None) -> None:
+    def begin_with(self, weights: Mapping[str, Any], where: object = None) -> None:
         """Begin with the network of another distillation.
 
         Args:

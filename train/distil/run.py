@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,7 @@ def run_distillation(
     seconds: float | None = None,
     process: DistributedProcess | None = None,
     begun: Callable[[], Path] | None = None,
-    begin_with: dict[str, Any] | None = None,
+    begin_with: Mapping[str, Any] | None = None,
 ) -> tuple[Dagger, Iteration | None]:
     """Train a student, and return the trainer and its last iteration.
 
