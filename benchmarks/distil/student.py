@@ -82,10 +82,10 @@ CPUs). Simulated trials have the looks that the student was trained with.
 
 What remains between simulation and Reality is the shape that is drawn: Reality's block has edges cut by 1.5 mm, the
 drawn one sharp ones. Of 16 episodes in Reality's physics (2 cores) the student of 96 pixels does 5 by Reality's
-images; 13 by simulated ones; and 13 by Reality's own images, with all their textures, lights, tones, errors of mounting
-and latency, of a scene with sharp edges (the longer one: 12). Without errors of mounting it did 6, without speckles and
-wood 8, under another lamp 6, without all of these 3. It leans on the outline to a pixel, and a more precise student
-does so more. The present defaults draw objects in other sizes and with cut edges (`--looks.size`, `--looks.chamfer`);
+images; 13 by simulated ones, 6 where these have edges cut by 1.5 mm; and 13 by Reality's own images, with all their
+textures, lights, tones, errors of mounting and latency, of a scene with sharp edges (the longer one: 12). Without
+errors of mounting it did 6, without speckles and wood 8, under another lamp 6, without all of these 3. It leans on the
+outline to a pixel, and a more precise student does so more. The present defaults draw objects in other sizes and with cut edges (`--looks.size`, `--looks.chamfer`);
 no student was trained with them yet.
 
 Two students before these, with 1,024 worlds and cameras displaced by up to 5 mm and 1 degree: 2.0 M samples in 302 s,
