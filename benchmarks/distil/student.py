@@ -84,9 +84,9 @@ What remains between simulation and Reality is the shape that is drawn: Reality'
 drawn one sharp ones. Of 16 episodes in Reality's physics (2 cores) the student of 96 pixels does 5 by Reality's
 images; 13 by simulated ones, 6 where these have edges cut by 1.5 mm; and 13 by Reality's own images, with all their
 textures, lights, tones, errors of mounting and latency, of a scene with sharp edges (the longer one: 12). Without
-errors of mounting it did 6, without speckles and wood 8, under another lamp 6, without all of these 3. It leans on the
-outline to a pixel, and a more precise student does so more. The present defaults draw objects in other sizes and with cut edges (`--looks.size`, `--looks.chamfer`);
-no student was trained with them yet.
+errors of mounting it did 6, without speckles and wood 8, under another lamp 6, without all of these 3. It leans on
+the outline to a pixel, and a more precise student does so more. The present defaults draw objects in other sizes and
+with cut edges (`--looks.size`, `--looks.chamfer`); no student was trained with them yet.
 
 Two students before these, with 1,024 worlds and cameras displaced by up to 5 mm and 1 degree: 2.0 M samples in 302 s,
 26 of 100 episodes in simulation and none of 48 in Reality; 7.0 M in 1,029 s, 122 and 4 of 200.
