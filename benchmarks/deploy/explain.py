@@ -52,12 +52,11 @@ trial failed, the case says nothing. *All together* is the verdict from six fail
 
 47 of 60 cases were begun and ended on a machine with 16 cores that was held for half an hour. Of the other 13, seven
 were measured later with the present search; the five short trainings and `joint_compliance=0.015` have none below.
-Policies with noise on their weights fail in 2 to 15 % of their trials alone, which replays do not repeat: their five
-cases stay unexplained. A diagnosis had 600 s of one slow processor. Those of these cases searched in two whole
-trials, contacts included, and named one effect of 18. The present version searches in the robot's free motion where
-this differs. All 20 cases of changed physics were measured again with that, on 16 slow cores, 12 cases at a time with
-`--seconds 1000`, before errors of poses were searched for in short windows: the table of missing effects is theirs.
-Load and Stribeck friction look like others where nothing is carried and joints hardly rest; the hidden damping is
+Policies with noise on their weights fail in 2 to 15 % of their trials alone; their five cases stay unexplained. A
+diagnosis had 600 s of one slow processor. Those of these cases searched in two whole trials, contacts included, and
+named one effect of 18. The present version searches in the robot's free motion where this differs. All 20 cases of
+changed physics were measured again with that, on 16 slow cores, 12 cases at a time with `--seconds 1000`, before
+errors of poses were searched for in short windows: the table of missing effects is theirs. The hidden damping is
 above what the library tries (37 to 44 times the nominal one).
 
 Errors of poses were searched for by replays of whole trials then. Some of the cases were measured again with the

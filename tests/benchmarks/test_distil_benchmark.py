@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+import concent_warp as cw
+from benchmarks.distil.shapes import KINDS, trial
 from benchmarks.distil.student import Args, Benchmark, page, variant_cfg
 from benchmarks.measurements import Measurements
 from tests.distil.conftest import TINY
@@ -47,8 +49,6 @@ def test_an_error_is_kept_and_tried_again(tmp_path):
 
 
 def _teacher():
-    import concent_warp as cw
-
     return cw.load_policy("shape_sorter"), "student", 0
 
 
@@ -59,3 +59,16 @@ def test_controls_differ_from_the_student_in_one_setting(variant):
     assert cfg.network.blind == (variant == "blind")
     assert (cfg.dagger.beta_end == 1) == (variant == "cloned")
     assert (cfg.method == "rsl_rl") == (variant == "rsl_rl")
+
+
+def test_a_student_is_tried_by_images_of_either_shape(tmp_path):
+    tiny = replace(TINY, dagger=replace(TINY.dagger, iterations=1))
+    student = cw.distil(cw.load_policy("shape_sorter"), tiny, device="cpu", out=tmp_path / "run")
+    machine = {"processor": "x", "cores": 2, "date": "2026-01-01", "python": "3"}
+    machine |= dict.fromkeys(("mujoco", "mujoco-warp", "warp-lang", "torch"), "1")
+    rows = [{"name": "tiny", "machine": machine, **trial(student, kind, 1, 0)} for kind in (KINDS[1], KINDS[3])]
+    assert [row["kind"] for row in rows] == [KINDS[1], KINDS[3]]
+    assert all(row["episodes"] == 1 and sum(row["outcomes"].values()) == 1 for row in rows)
+    text = page([], rows)
+    assert f"| {KINDS[3]} | {rows[1]['successes']} of 1 |" in text
+    assert "## Shapes" not in page([], [])
