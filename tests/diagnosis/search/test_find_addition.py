@@ -23,6 +23,10 @@ class MadeUp(SimpleNamespace):
         """Return its gain over a baseline."""
         return self.gain - getattr(base, "less", 0.0)
 
+    def removed(self, base: Any) -> np.ndarray:
+        """Return what it takes from the residuals of a baseline."""
+        return np.array([self.share(base)])
+
 
 def candidate(name: str, *, is_part: bool = False) -> Any:
     """Return a candidate, or a part of an element."""
