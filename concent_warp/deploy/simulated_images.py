@@ -229,10 +229,10 @@ class RandomisedCamera:
         """Sample other looks for all worlds."""
         self._source.begin(torch.ones(self._worlds, dtype=torch.bool, device=self._device))
 
-    def shoot(self, qpos: torch.Tensor, mocap: tuple[torch.Tensor, torch.Tensor] | None = None) -> Layers:
+    def shoot(self, qpos: torch.Tensor | np.ndarray, mocap: tuple[torch.Tensor, torch.Tensor] | None = None) -> Layers:
         """Return the images of all worlds, qpos (W, nq) and mocap as for `HybridCamera.shoot`; of one layer only."""
         assert mocap is not None
-        image = self._source.render(qpos, mocap).permute(0, 1, 3, 4, 2).float() / 255
+        image = self._source.render(torch.as_tensor(qpos), mocap).permute(0, 1, 3, 4, 2).float() / 255
         nothing = torch.zeros_like(image)
         return Layers(image, image, nothing, nothing[..., 0], nothing[..., 0], image)
 
