@@ -174,7 +174,7 @@ class DaggerCfg:
         1.0
     """
 
-    iterations: Count = 1400
+    iterations: Count = 1100
     """Iterations of collecting samples and updating the student."""
     worlds: Worlds = 2048
     """Number of environments simulated in parallel, on each rank."""
