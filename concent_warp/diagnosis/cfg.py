@@ -133,8 +133,13 @@ class SearchCfg:
     """Most candidates that are tried again in the place of an earlier addition once others are in the model.
     Empirical."""
     alternatives: Annotated[int, Bounds(0, 1000)] = 1
-    """Most rivals of the first of several effects from which the search is continued, too [-]; 0 for none.
-    Empirical."""
+    """Most rivals of the first effect from which the search is continued, too, where an answer reaches the noise [-]; 0
+    for none at all. Empirical."""
+    alternatives_beyond_noise: Annotated[int, Bounds(0, 1000)] = 3
+    """The same while all answers leave more than noise [-]. Empirical."""
+    parallel_rivals: Share = 0.95
+    """Cosine between what two rivals take from the residuals, from which on the search is continued from the stronger
+    alone [-]: less than a tenth of what either takes, in squares, is then its own."""
     min_fold_share: Share = 0.8
     """Share of the folds' gains and losses that an accepted effect must gain [-]: 4 of 5. A fold whose motions hardly
     show the effect loses or gains little."""

@@ -118,9 +118,23 @@ class Procedure:
                 budget.cut |= set(range(len(found)))
                 return found, detectable
         fitted, smallest = add_effects(fitted, detectable)
-        if len(self.record.accepted()) > 1:
+        if self._may_be_imitation(fitted, given):
             fitted = try_alternatives(self.additions, fitted)
         return fitted, detectable or smallest
+
+    def _may_be_imitation(self, fitted: Sequence[FittedModel], given: FittedModel) -> bool:
+        """Return whether the effects that were added may stand for others that act together.
+
+        Several may always. A single one that explains the data does not; one that leaves more than noise and errors in
+        its formula, beside which nothing else was accepted, takes up parts of several effects, and then each of these
+        is left too small, or too much distorted, to be found beside it.
+
+        Args:
+            fitted: The model as given and after each addition.
+            given: The model as given, over windows as long as the motion allows.
+        """
+        count = len(self.record.accepted())
+        return count > 1 or (count == 1 and not self.context.explains(fitted[-1], given, added=True))
 
     def carry_over(self, base: FittedModel, coarse: Sequence[FittedModel]) -> list[FittedModel]:
         """Return the model as given and after each addition over short windows, fitted again to its own windows.

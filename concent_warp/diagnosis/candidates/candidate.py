@@ -145,3 +145,8 @@ class FittedCandidate:
     def share(self, base: FittedModel) -> float:
         """Return the gain as a share of the baseline's held-out error [-]."""
         return float(self.gain(base).sum() / max(base.errors.sum(), 1e-12))
+
+    def removed(self, base: FittedModel) -> np.ndarray:
+        """Return what it takes from the baseline's residuals, in units of the noise, shape (n,)."""
+        before, after = (np.concatenate([piece.residual for piece in one.pieces]) for one in (base, self))
+        return before - after

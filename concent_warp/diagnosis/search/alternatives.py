@@ -1,8 +1,11 @@
 """The first of several effects replaced by its rivals, and the search continued from each.
 
 Effects are added one at a time, and the first is chosen while the others are still missing: one that stands for parts
-of several then comes before each of them, and what is left leads to a second imitation. A search that keeps a few
-beginnings finds sets of effects that no exchange of a single one leads to (beam search).
+of several then comes before each of them, and what is left leads to a second imitation, or to nothing. A search that
+keeps a few beginnings finds sets of effects that no exchange of a single one leads to (beam search).
+
+The strongest rival comes first. The strongest ones are often alike, such as a lag, a delay and a latency, and searches
+from them end in the same place: of the others those come next that take something else from the residuals.
 """
 
 from __future__ import annotations
@@ -13,9 +16,10 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import leaves_more, surprise
-from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.adequacy import discrepancies
+from concent_warp.diagnosis.search.adequacy import discrepancies, least_ratio
+from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.diagnosis.search.record import SearchRecord
 
@@ -29,21 +33,27 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
 
     Args:
         additions: The search; its record is that of the returned models afterwards.
-        fitted: The model as given and after each addition, at least two.
+        fitted: The model as given and after each addition, at least one.
     """
     context, first = additions.context, fitted[0]
     cfg, budget, begun = context.cfg, context.budget, context.record
     cut, unsettled = set(budget.cut), list(budget.unsettled)
     answers = [(fitted, begun)]
     equals = set(begun.groups[0])
-    others = [
-        r for r in begun.rivals.get(0, ()) if r.finding.name not in equals and r.finding.p <= cfg.significance_level
-    ]
-    for rival in others[: cfg.search.alternatives]:
+    rivals = begun.rivals.get(0, ())
+    tried = [r for r in rivals if r.finding.name in equals]
+    others = [r for r in rivals if r.finding.name not in equals and r.finding.p <= cfg.significance_level]
+    for count in range(_most(cfg.search)):
+        enough = count >= cfg.search.alternatives and any(_reaches_noise(context, found[-1]) for found, _ in answers)
+        if not others or enough:
+            break
+        rival = others.pop(0)
         context.record = begun.copy()
         context.progress(f"trying {rival.finding.name} as the first effect")
         open_question = f"Open: whether {rival.finding.name} with another effect explains more."
         found = budget.attempt(lambda r=rival: _from(additions, first, r), None, open_question)
+        tried.append(rival)
+        others = [r for r in others if not any(r.is_like(t, cfg.search.parallel_rivals) for t in tried)]
         if found is not None and budget.cut == cut:
             answers.append((found, context.record))
             continue
@@ -67,6 +77,16 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
         if log_odds(other[-1], best[-1], first if errors else None, cfg) > -2 * np.log(cfg.search.max_odds):
             _add_to_group(context.record, of_other, other[-1])
     return best
+
+
+def _most(cfg: SearchCfg) -> int:
+    """Return how many rivals are tried at most."""
+    return max(cfg.alternatives, cfg.alternatives_beyond_noise) if cfg.alternatives else 0
+
+
+def _reaches_noise(context: SearchContext, one: FittedModel) -> bool:
+    """Return whether a fitted model leaves little more than noise: no other effects could explain more then."""
+    return least_ratio(one, context.noise_factors) <= context.cfg.search.explained_ratio
 
 
 def log_odds(other: FittedModel, best: FittedModel, first: FittedModel | None, cfg: DiagnoseCfg) -> float:

@@ -7,7 +7,7 @@ theirs. Once they are in the model, its rivals are fitted again in its place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,6 +31,13 @@ class Rival:
     """The effect with its values."""
     fit: Fit
     """Its fit, with all other values and the initial states."""
+    removed: np.ndarray = field(default_factory=lambda: np.zeros(0), compare=False)
+    """What it takes from the residuals of the model that it was added to, in units of the noise, shape (n,)."""
+
+    def is_like(self, other: Rival, cosine: float) -> bool:
+        """Return whether it takes much the same from the residuals as another one: they are parallel."""
+        lengths = float(np.linalg.norm(self.removed) * np.linalg.norm(other.removed))
+        return bool(self.removed @ other.removed >= cosine * lengths > 0)
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def near_best(
     least = cfg.search.restart_min_gain * max(c.share(base) for c in fits)
     near = [(c, f) for c, f in zip(fits, findings, strict=True) if c.share(base) >= least]
     ranked = sorted(near, key=lambda pair: -pair[0].share(base))
-    return tuple(Rival(f, c.model.effects[-1], c.fit) for c, f in ranked[: cfg.search.reconsidered])
+    return tuple(Rival(f, c.model.effects[-1], c.fit, c.removed(base)) for c, f in ranked)
 
 
 def beside(base: FittedModel, rival: Rival) -> FittedModel:

@@ -63,7 +63,8 @@ class Revision:
         context, record = self.context, self.context.record
         accepted = record.accepted()
         for k, f in enumerate(accepted[:-1]):
-            if len(among := record.rivals.get(f.step, ())) < 2:
+            among = record.rivals.get(f.step, ())[: context.cfg.search.reconsidered]
+            if len(among) < 2:
                 continue
             context.progress("trying earlier rivals beside later effects")
             last, unsettled = fitted[-1], f"Open: whether another effect than {f.name} explains more beside the others."

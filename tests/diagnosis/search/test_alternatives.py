@@ -151,11 +151,59 @@ def test_as_many_rivals_are_tried_as_asked_for_and_none_of_the_group_of_the_firs
         assert (made.record.provisional, made.record.time_step) == (1, None)
 
 
-def test_a_single_effect_has_no_alternatives(monkeypatch):
-    monkeypatch.setattr(procedure, "try_alternatives", lambda *_: pytest.fail("one effect was added"))
+def test_a_single_effect_that_explains_the_data_has_no_alternatives(monkeypatch):
+    monkeypatch.setattr(procedure, "try_alternatives", lambda *_: pytest.fail("it explains the data"))
+    made = searching(1, recording=swung(seconds=3.0))
+    made.search(made.baseline())
+    assert accepted(made) == ["joint_damping"]
+
+
+def test_a_single_effect_that_leaves_more_than_noise_has_alternatives(monkeypatch):
+    # One effect may be added: the lag leaves what it does not imitate of damping and delay.
+    tried = []
+    monkeypatch.setattr(procedure, "try_alternatives", lambda _, fitted: tried.append(names(fitted[-1])) or fitted)
     made = searching(1, max_additions=1)
     made.search(made.baseline())
-    assert len(accepted(made)) == 1
+    assert tried == [["actuator_lag"]]
+
+
+def begun_from(greedy: tuple[Procedure, list[FittedModel]], monkeypatch, *, noisy: bool, parallel: bool) -> list[str]:
+    """Return the rivals from which a search is continued.
+
+    Args:
+        greedy: The search.
+        monkeypatch: Of the test.
+        noisy: Whether all answers leave more than noise.
+        parallel: Whether the second rival takes from the residuals what the first one takes.
+    """
+    made, begun = resumed(greedy, 1), []
+    axes = np.eye(2)
+    removed = {"actuator_lag": axes[0], "actuator_delay": axes[0], "joint_damping": axes[0 if parallel else 1]}
+    rivals = tuple(replace(r, removed=removed[r.finding.name]) for r in made.record.rivals[0])
+    made.record.rivals = {**made.record.rivals, 0: rivals}
+    monkeypatch.setattr(module, "least_ratio", lambda *_: 1.5 if noisy else 1.0)
+    monkeypatch.setattr(
+        made.additions, "add_effects", lambda fitted, _: (begun.append(names(fitted[-1])[-1]) or fitted, ())
+    )
+    try_alternatives(made.additions, greedy[1])
+    return begun
+
+
+def test_more_rivals_are_tried_while_all_answers_leave_more_than_noise(greedy, monkeypatch):
+    with monkeypatch.context() as patch:
+        assert begun_from(greedy, patch, noisy=False, parallel=False) == ["actuator_delay"]
+    assert begun_from(greedy, monkeypatch, noisy=True, parallel=False) == ["actuator_delay", "joint_damping"]
+
+
+def test_a_rival_that_takes_away_what_an_earlier_one_does_is_not_tried(greedy, monkeypatch):
+    assert begun_from(greedy, monkeypatch, noisy=True, parallel=True) == ["actuator_delay"]
+
+
+def test_rivals_are_alike_by_the_angle_between_what_they_take_away(base):
+    one = rival_of(added(base, JointDamping("hinge")))
+    for removed, alike in (([1.0, 0.1], True), ([5.0, 0.5], True), ([1.0, 1.0], False), ([-1.0, 0.0], False)):
+        other = replace(one, removed=np.array(removed))
+        assert replace(one, removed=np.array([1.0, 0.0])).is_like(other, 0.95) is alike
 
 
 def test_an_alternative_that_there_is_no_time_for_is_named_and_the_answer_stays(greedy, monkeypatch):

@@ -11,10 +11,13 @@ import pytest
 
 from concent_warp.diagnosis.candidates.baseline import fit_baseline, refit_without_effect
 from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search import reconsider as module
 from concent_warp.diagnosis.search.reconsider import Rival, near_best, reconsider
+from concent_warp.effects.library.joints import JointDamping
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
@@ -92,6 +95,10 @@ class MadeUp:
         """Return the gain over a baseline."""
         return self.gain - base
 
+    def removed(self, base: Any) -> np.ndarray:
+        """Return what it takes from the residuals."""
+        return np.array([self.gain, base])
+
 
 def near(gains: dict[str, float], base: float = 0.0, **changes: Any) -> list[str]:
     """Return the names of those near the best, best first."""
@@ -112,10 +119,13 @@ def test_rivals_are_those_that_explain_at_least_half_as_much_as_the_best_in_thei
     assert near({"a": -0.2, "b": 0.1}) == ["b"]
 
 
-def test_no_more_rivals_are_kept_than_asked_for():
-    gains = {n: 0.8 - 0.01 * k for k, n in enumerate("gfedcba")}
-    assert near(gains) == list("gfedc")
-    assert near(gains, reconsidered=2) == ["g", "f"]
+def test_a_rival_is_kept_with_what_it_takes_from_the_residuals():
+    before = fitted()
+    c = fit_candidate(before, screen(before, JointDamping("hinge")))
+    (found,) = near_best(before, [c], [finding("joint_damping")], CFG)
+    was, left = (np.concatenate([piece.residual for piece in one.pieces]) for one in (before, c))
+    assert np.array_equal(found.removed, was - left)
+    assert np.linalg.norm(left) < 0.8 * np.linalg.norm(was)
 
 
 def test_the_rival_that_explains_more_beside_the_others_takes_the_place_of_an_earlier_effect(wrong, right, alone):

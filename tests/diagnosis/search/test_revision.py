@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure as module
-from concent_warp.diagnosis.cfg import NominalCfg
+from concent_warp.diagnosis.cfg import NominalCfg, SearchCfg
 from concent_warp.diagnosis.search import additions, context, revision
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.simulate.time_limit import TimeUpError
@@ -210,6 +210,16 @@ def test_earlier_additions_are_reconsidered_beside_later_ones(monkeypatch):
             replaced = next(f for f in made.record.findings if f.name == "a")
             assert replaced.reason == "another one explains more beside the others"
             assert made.record.findings[-1].parameters == parameters
+
+
+def test_no_more_rivals_are_reconsidered_than_asked_for(monkeypatch):
+    asked: list[Any] = []
+    made = procedure()
+    made.context.cfg = replace(made.context.cfg, search=SearchCfg(reconsidered=2))
+    made.record.findings, made.record.rivals = [finding("a", 0.5), finding("d", 0.3, step=1)], {0: rivals(*"abc")}
+    monkeypatch.setattr(revision, "reconsider", lambda *args: asked.append(args))
+    made.revision.reconsidered([node(5), node(3, effects=3), node(1.0, 100.0, effects=4)])
+    assert [r.finding.name for r in asked[0][2]] == ["a", "b"]
 
 
 def test_an_addition_without_rivals_is_not_reconsidered(monkeypatch):
