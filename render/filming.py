@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
 
-from concent_warp.render.composite import HybridCamera
+from concent_warp.render.composite import Layers
 from concent_warp.render.dataset.layout import DatasetWriter, EpisodeWriter
 from concent_warp.render.dataset.video import VideoWriter
 from concent_warp.render.figure import FrameSelection
@@ -18,12 +19,34 @@ FILMS = "films"
 """Folder of the MP4 videos, in that of the data set."""
 
 
+class FilmCamera(Protocol):
+    """What renders W worlds, frame by frame."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the C cameras."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of an image [px]."""
+        ...
+
+    def begin(self) -> None:
+        """Begin episodes in all worlds."""
+        ...
+
+    def shoot(self, qpos: torch.Tensor | np.ndarray, mocap: tuple[torch.Tensor, torch.Tensor] | None = None) -> Layers:
+        """Return the images of all worlds, see `HybridCamera.shoot`."""
+        ...
+
+
 class DatasetFilming:
     """Renders the episodes of W worlds to a data set."""
 
     def __init__(
         self,
-        camera: HybridCamera,
+        camera: FilmCamera,
         writer: DatasetWriter,
         task: str,
         *,

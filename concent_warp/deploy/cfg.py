@@ -15,6 +15,7 @@ from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.render.shadow_cfg import ShadowCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
+from concent_warp.train.distil.cfg import LooksCfg
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 
 WorldName = Literal["simulation", "reality"]
@@ -148,6 +149,9 @@ class RenderCfg:
     """Height and width of the images [px]."""
     show: Literal["visual", "spheres"] = "visual"
     """Geometry of the objects in the raw image: visual shapes or contact spheres."""
+    randomise: bool = False
+    """Ray-trace a policy's episodes under random looks, which are sampled for each episode (`looks`): for policies
+    that are to see what no model looks like, without networks and splats."""
     rate: Annotated[int, Bounds(1, 1000)] = 10
     """Frame rate of a rendered recording [Hz]; a policy's episodes have its control rate."""
     worlds: Worlds = 8
@@ -166,6 +170,8 @@ class RenderCfg:
     """Seed of initial states, lights and noise."""
     lights: ShadowCfg = field(default_factory=ShadowCfg)
     """Settings of the lights."""
+    looks: LooksCfg = field(default_factory=LooksCfg)
+    """Random looks, as those of a distillation; used with `randomise`."""
     handover: HandoverCfg = field(default_factory=HandoverCfg)
     """Settings of the hand-over from another policy, where one is given."""
 

@@ -27,15 +27,17 @@ from concent_warp.scene.cameras import BASE, WRIST
 
 if TYPE_CHECKING:
     from concent_warp.deploy.handover import Handover
+    from concent_warp.deploy.simulated_images import RandomisedCamera
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
     from concent_warp.render.composite import HybridCamera
     from concent_warp.render.dataset.layout import DatasetWriter, EpisodeLayout
-    from concent_warp.render.filming import DatasetFilming
+    from concent_warp.render.filming import DatasetFilming, FilmCamera
     from concent_warp.train.distil.student import Student
     from concent_warp.train.environment.environment import Environment
     from concent_warp.train.flow.policy import FlowPolicy
     from concent_warp.train.policy.load import Policy
+    from concent_warp.train.task.task import Task
     from concent_warp.train.trials.episodes import PolicyFunction
 
 FREE = ("out", "resume", "overwrite", "source", "episodes", "worlds", "films", "figure", "device")
@@ -107,6 +109,7 @@ def render(
     cfg, out = cfg or RenderCfg(), Path(out)
     check_settings(cfg, RenderError)
     check_device(device)
+    _check_randomised(cfg)
     if cfg.figure is not None:
         claim_file(cfg.figure, overwrite=overwrite or resume)
     _check_replaced(out, overwrite=overwrite)
@@ -117,6 +120,8 @@ def render(
         to = Destination(claimed.path, cfg, format, device, resume, driver)
         from concent_warp.recording.recording import Recording
 
+        if cfg.randomise and isinstance(source, Recording):
+            raise RenderError("random looks are those of a policy's task", expected="a policy", found="a recording")
         if driver is not None and isinstance(source, Recording):
             raise RenderError("a recording is not driven", expected="a policy that takes over", found="a recording")
         film = _film_recording if isinstance(source, Recording) else _film_policy
@@ -140,6 +145,18 @@ class Destination:
 def _ignore(share: float) -> None:
     """Do nothing with the progress."""
     del share
+
+
+def _check_randomised(cfg: RenderCfg) -> None:
+    """Check that random looks are not asked for with what has looks of its own.
+
+    Raises:
+        RenderError: They are.
+    """
+    given = {"networks": cfg.networks, "splats": cfg.splats, "figure": cfg.figure, "show": cfg.show != "visual"}
+    if cfg.randomise and (others := [name for name, value in given.items() if value]):
+        expected = "neither networks, splats, figure of layers, nor spheres"
+        raise RenderError("random looks are of the ray-traced scene alone", expected=expected, found=", ".join(others))
 
 
 def _check_replaced(folder: Path, *, overwrite: bool) -> None:
@@ -175,7 +192,10 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     rate = round(1 / environment.control_step)
     if abs(rate * environment.control_step - 1) > 1e-6:
         raise RenderError("a video needs a whole number of frames per second", found=1 / environment.control_step)
-    camera, model = _hybrid_camera(cfg, task.model, worlds, to.device)
+    if cfg.randomise:
+        camera, model = _task_camera(cfg, task, worlds, str(environment.device))
+    else:
+        camera, model = _hybrid_camera(cfg, task.model, worlds, to.device)
     joints, layout = _addressed(model, camera, rate)
     labelled = to.driver is not None and cfg.handover.frames == "labelled"
     if labelled:
@@ -313,7 +333,19 @@ def _hybrid_camera(
     return camera, model
 
 
-def _addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[np.ndarray, EpisodeLayout]:
+def _task_camera(cfg: RenderCfg, task: Task, worlds: int, device: str) -> tuple[RandomisedCamera, mujoco.MjModel]:
+    """Return what renders a task under random looks, and the scene's model with the cameras as they are meant."""
+    from concent_warp.deploy.simulated_images import RandomisedCamera
+    from concent_warp.model import Model
+    from concent_warp.scene.cameras import BASE_FOVY, with_cameras
+    from concent_warp.train.distil.cfg import ImagesCfg
+
+    images = ImagesCfg(cfg.cameras or (BASE, WRIST), base_fovy=BASE_FOVY, size=cfg.size, shadows=cfg.shadows)
+    camera = RandomisedCamera(task, worlds, images, cfg.looks, device)
+    return camera, Model(with_cameras(task.model.scene, images.cameras), task.model.geometry).spec().compile()
+
+
+def _addressed(model: mujoco.MjModel, camera: FilmCamera, rate: int) -> tuple[np.ndarray, EpisodeLayout]:
     """Return where the joints of one degree of freedom are in qpos, and the layout of a data set of them."""
     from concent_warp.render.dataset.layout import EpisodeLayout
 
@@ -350,7 +382,7 @@ def _dataset_writer(to: Destination, layout: EpisodeLayout, model: mujoco.MjMode
     return LeRobotWriter(to.out, layout, codec=to.cfg.codec)
 
 
-def _new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, task: str, rate: int) -> DatasetFilming:
+def _new_filming(to: Destination, camera: FilmCamera, writer: DatasetWriter, task: str, rate: int) -> DatasetFilming:
     """Return what takes the frames to the data set."""
     from concent_warp.render.filming import FILMS, DatasetFilming
 

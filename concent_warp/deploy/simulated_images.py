@@ -19,7 +19,7 @@ from concent_warp.errors import RenderError
 from concent_warp.kernels.patterns import WAVES, paint_patterns
 from concent_warp.model import Model
 from concent_warp.render.cameras import place_cameras
-from concent_warp.render.composite import HybridCamera
+from concent_warp.render.composite import HybridCamera, Layers
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import to_bytes
 from concent_warp.render.raw import Launches, PosedWorlds, RawCamera, camera_ids
@@ -215,6 +215,26 @@ class RandomisedImages:
             ]  # fmt: skip
             image = wp.from_torch(self._image.flatten(0, 1))
         return lambda: paint_patterns(inputs, image, where)
+
+
+class RandomisedCamera:
+    """Cameras under random looks, for a data set: what films episodes begins all worlds at once."""
+
+    def __init__(self, task: Task, worlds: int, images: ImagesCfg, looks: LooksCfg, device: str) -> None:
+        """Put the scene on a device; see `RandomisedImages`."""
+        self._source, self._worlds, self._device = RandomisedImages(task, worlds, images, looks, device), worlds, device
+        self.cameras, self.size = self._source.cameras, (images.size, images.size)
+
+    def begin(self) -> None:
+        """Sample other looks for all worlds."""
+        self._source.begin(torch.ones(self._worlds, dtype=torch.bool, device=self._device))
+
+    def shoot(self, qpos: torch.Tensor | np.ndarray, mocap: tuple[torch.Tensor, torch.Tensor] | None = None) -> Layers:
+        """Return the images of all worlds, qpos (W, nq) and mocap as for `HybridCamera.shoot`; of one layer only."""
+        assert mocap is not None
+        image = self._source.render(torch.as_tensor(qpos), mocap).permute(0, 1, 3, 4, 2).float() / 255
+        nothing = torch.zeros_like(image)
+        return Layers(image, image, nothing, nothing[..., 0], nothing[..., 0], image)
 
 
 class HybridImages:

@@ -54,6 +54,15 @@ def test_labels_are_the_actions_of_the_teacher_on_the_true_state(teacher):
     assert torch.allclose(made.samples.action[:2], expected, atol=1e-5)
 
 
+def test_stages_follow_one_another_earlier_than_in_the_teachers_training_and_never_later():
+    teacher = cw.load_policy("pick_align_insert")
+    for tolerance, expected in ((0.01, 0.01), (0.001, 0.004)):
+        cfg = replace(TINY, states=8, free=1.0, tolerance=tolerance)
+        environment = Distillation(teacher, cfg, lambda _: None).environment("cpu", 0)  # pyright: ignore
+        assert environment._settings.chain.tolerance == expected
+        assert bool(environment._from_start.all())
+
+
 def test_a_distillation_that_stopped_continues_exactly(teacher, student, tmp_path):
     out = tmp_path / "stopped"
     stopped = cw.distil(teacher, TINY, device="cpu", out=out, seconds=0)

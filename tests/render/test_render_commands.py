@@ -1,6 +1,7 @@
 """The whole way at small size: footage, networks, splats, a data set; on a CPU, in seconds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from small_dataset import read_frames
 
 import concent_warp as cw
 from concent_warp.cli.entry import main
+from concent_warp.errors import ConcentError
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.logs.readers.calibration import read_calibration
 from concent_warp.recording.recording import ImageStream
@@ -115,6 +117,8 @@ def test_data_set_is_gone_on_with(folder, capsys):
         (("--recording", "held.h5", "--splats", "cup=ball.ply", "--cameras", "base"), "no such body"),
         (("--recording", "held.h5", "--networks", "nowhere"), "no trained networks"),
         (("--recording", "held.h5", "--networks", "net", "--size", "96"), "images of another size"),
+        (("--recording", "held.h5", "--randomise"), "random looks are those of a policy's task"),
+        (("--pretrained", "--randomise", "--splats", "ball=ball.ply"), "random looks are of the ray-traced scene"),
     ],
 )
 def test_what_cannot_be_rendered_is_reported_in_one_sentence(folder, options, said, monkeypatch, capsys):
@@ -168,3 +172,16 @@ def test_policy_is_rendered_to_the_frames_of_its_episodes(tmp_path, capsys):
         assert found.body == expected.body
         assert found.position == pytest.approx(expected.position, abs=1e-6)
         assert found.fovy == pytest.approx(expected.fovy, abs=1e-6)
+
+
+def test_random_looks_differ_from_episode_to_episode_and_stay_within_one(tmp_path):
+    out, policy = tmp_path / "random", cw.load_policy("shape_sorter")
+    cfg = cw.RenderCfg(episodes=2, worlds=2, size=32, cameras=("base",), keep="all", randomise=True)
+    assert cw.render(policy, out, cfg, device="cpu").episodes == 2
+    seen = frames(out, "base")
+    first, second = seen[:60], seen[60:]
+    within = max(float(np.abs(one[1] - one[0]).mean()) for one in (first, second))
+    assert within < 0.3 * float(np.abs(first[0] - second[0]).mean())
+    still = replace(cfg.looks, colour=0.0, hue_share=0.0, pattern=0.0, grain_share=0.0, light_strength=(0.5, 0.5))
+    with pytest.raises(ConcentError, match="other settings"):
+        cw.render(policy, out, replace(cfg, looks=still, episodes=3), device="cpu", resume=True)

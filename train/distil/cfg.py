@@ -174,7 +174,7 @@ class DaggerCfg:
         1.0
     """
 
-    iterations: Count = 1400
+    iterations: Count = 1100
     """Iterations of collecting samples and updating the student."""
     worlds: Worlds = 2048
     """Number of environments simulated in parallel, on each rank."""
@@ -233,6 +233,12 @@ class DistilCfg:
     """Time between checkpoints [s]; one is also written at the end and on interruption."""
     states: Count | None = None
     """Initial states of the episodes; as many as in the teacher's training by default."""
+    free: Share = 0.5
+    """In chains of stages, share of these that are of the whole task, see `ResetCfg.free`: a student begins there, and
+    has the most to see there."""
+    tolerance: Positive = 0.01
+    """In chains of stages, least `ChainCfg.tolerance` [m]: a student does not observe the stage. A teacher that waits
+    for a grasp as exact as its own labels the same images otherwise, by whether the student's was within it."""
     dagger: DaggerCfg = field(default_factory=DaggerCfg)
     """The training."""
     images: ImagesCfg = field(default_factory=ImagesCfg)

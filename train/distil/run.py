@@ -39,9 +39,14 @@ class Distillation:
     """Makes the cameras of an environment's worlds."""
 
     def environment(self, device: str, seed: int) -> Environment:
-        """Return the worlds of a training, as the teacher was trained in them."""
+        """Return the worlds of a training, as the teacher was trained in them but for `free` and `tolerance`."""
         run, cfg = self.teacher.run, self.cfg
         settings = replace(run.cfg.environment, worlds=cfg.dagger.worlds)
+        settings = replace(
+            settings,
+            reset=replace(settings.reset, free=cfg.free),
+            chain=replace(settings.chain, tolerance=max(cfg.tolerance, settings.chain.tolerance)),
+        )
         if (buffers := self.teacher.weights.get("buffers")) is not None:
             settings = replace(settings, nconmax=int(buffers[0]), njmax=int(buffers[1]))
         task = run.task()
