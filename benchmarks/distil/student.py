@@ -46,52 +46,75 @@ CONTROLS = {
 }
 """Controls and what they are."""
 EARLIER = {
+    "short": "a student by 230 iterations",
+    "begun": "a student by 230 iterations, begun with the residual one below",
     "coarse": "an earlier student: four convolutions, 64 pixels",
     "sharp": "an earlier student: residual network, 96 pixels",
     "longer": "the same, trained longer",
 }
 """Students of other settings than the defaults, see the notes."""
 TITLES = {TEACHER: "the teacher, which observes the state", STUDENT: "the student, by DAgger", **EARLIER, **CONTROLS}
-WORLDS: tuple[TrialName, ...] = ("simulation", "reality")
+WORLDS: tuple[TrialName, ...] = ("simulation", "stress", "reality")
 ABOUT = """\
 `python -m benchmarks.distil.student --out F --teachers T...`: a teacher observes poses of the objects, a student two
 square images of {size} pixels, joint readings and commands. The student learns from ray-traced images under random
 colours, patterns, lights, camera poses and delays, labelled by the teacher in the states that the student gets into.
 In Reality it acts by Reality's own cameras: other textures, lights and colours, vignette, blur, noise of 2/255,
 mounting errors of up to 3 mm and 0.5 degrees, 20 to 70 ms of latency; friction, masses and gains vary as for policies
-that observe the state, and nothing of Reality was seen in training. Each row is {episodes} episodes from initial states
-that were not trained from; the seeds of a row are pooled, intervals are Wilson's. Time is that of one distillation
+that observe the state, and nothing of Reality was seen in training. Each row is {episodes} episodes from
+initial states that were not trained from; the seeds of a row are pooled, intervals are Wilson's. Time is that of one distillation
 without the start of the simulator.
 
 In insertion alone the box is always at one place and the block is in the hand: joint readings and the leads of the
 commands tell a blind student most of what it needs. In the whole task both objects are placed at random.
 """
 NOTES = """\
-No row is of the present defaults, which came last. This benchmark was not run to its end: rows were measured by the
-commands below and entered by a script, each with one seed and one teacher, `concent evaluate --episodes 200 --seed 1`
-in each world (the first student and the blind one `--seed 0`, the blind one in Reality 100 episodes, the teacher on
-CPUs). Simulated trials have the looks that the student was trained with.
+This benchmark was not run to its end: rows were measured by the commands below and entered by a script, with one
+teacher, `concent evaluate --episodes 200` in each world, `--seed 2` for students by 230 iterations, 1 for the residual
+ones and the teacher, 0 for the others. The teacher acted on CPUs; the blind student has 100 episodes in Reality.
+The stress test has 16 episodes of the first seed, 100 of the teacher, on CPUs, `--seed 2`. Simulated trials have the
+looks that the student was trained with.
 
+- *230 iterations*: the present settings but for their number, `concent distil pick_align_insert --iterations 230
+  --dagger.beta-iterations 40`, and with `--seed 1 --dagger.updates 24`. By one seed and the other 97.0 and 98.0 % in
+  simulation, 35.5 and 30.5 % in Reality; predicted positions are 3.3 and 2.8 mm off on average.
+- *Begun*: `--begin-with` the residual student below, `--dagger.beta 0 --iterations 230`, seeds 0 and 1: 100 and 99.5 %
+  in simulation, 31.0 and 26.5 % in Reality, 2.4 mm.
+- A student by the 1,100 iterations of the defaults was lost with its machine after 306 of them, at 96 to 99 % of the
+  episodes of the training. No row is of the defaults.
 - *Four convolutions, 64 pixels*: 1,400 iterations of 2,048 worlds and 4 steps; images shifted by up to 2 pixels, 10 mm,
   in training.
 - *Residual network, 96 pixels*: `concent distil pick_align_insert --iterations 1100 --dagger.auxiliary 0.3
   --looks.grain-share 0.3 --looks.grain-length 0.008 0.05 --looks.stripe-share 0 --looks.renewed 0 --looks.size 0
-  --looks.chamfer 0 0`. Predicted positions are 3.1 mm off on average. With `--seed 0`, at which the causes were looked
-  for: 168 of 200 in simulation, 59 in Reality.
-- *Longer*: begun with it (`--begin-with`), 1,250 iterations of 2 steps, `--dagger.beta 0 --looks.size 0
-  --looks.chamfer 0 0`, finer grains, stripes, looks renewed within episodes: 2.3 mm.
+  --looks.chamfer 0 0 --free 0.2 --tolerance 0.004`. Predicted positions are 3.1 mm off on average. With `--seed 0`, at
+  which the causes were looked for: 168 of 200 in simulation, 59 in Reality.
+- *Longer*: begun with it, 1,250 iterations of 2 steps, `--dagger.beta 0 --looks.size 0 --looks.chamfer 0 0 --free 0.2
+  --tolerance 0.004`, finer grains, stripes, looks renewed within episodes: 2.3 mm.
 - *Blind*: 400 iterations; its success had not risen for the last half of them.
 
 Two students before these, with 1,024 worlds and cameras displaced by up to 5 mm and 1 degree: 2.0 M samples in 302 s,
 26 of 100 episodes in simulation and none of 48 in Reality; 7.0 M in 1,029 s, 122 and 4 of 200.
+
+Why the residual student failed in simulation was seen in 16 of its episodes. The teacher observes the stage, which the
+student cannot: in the six that failed a grasp was more than 4 mm off, so that the stage "pick" never ended and the
+teacher went on correcting it; with stages that end within 10 mm its labels in the same states say clearly where to go.
+Two settings follow from it, `--tolerance` and `--free`; they were not tried one by one.
 """
 
 SHAPES_ABOUT = """\
-Most of what remains between simulation and Reality is the shape that is shown: Reality's block has edges cut by 1.5
-mm, the model's sharp ones. `python -m benchmarks.distil.shapes runs/student` tries a student in Reality's physics by
-Reality's images and by simulated ones, of either shape; Reality's images have all their textures, lights, tones,
-errors of mounting and latency in both. The cause was looked for at other seeds. The present defaults draw objects in
-other sizes and with cut edges (`--looks.size`, `--looks.chamfer`); no student was trained with them yet.
+What remains between simulation and Reality. `python -m benchmarks.distil.shapes runs/student` tries a student in
+Reality's physics by Reality's images and by simulated ones, of either shape: Reality's block has edges cut by 1.5 mm,
+the model's sharp ones. Reality's images have all their textures, lights, tones, errors of mounting and latency in both.
+*Before* is the residual student, *230 iterations more* the first of those that were begun with it.
+
+All trials of the latter reach the hole; those that fail end on its rim, with the block 2 to 4 mm beside it. Its
+estimate of where the block is to the hole is off by as much, by Reality's images to the same side in most trials, by 2
+mm on average. In simulation a block so far off slides in, since its edges are spheres: the student never was in such a
+state. In the stress test, in which objects have their own shapes and edges catch, it fails by simulated images too,
+though its teacher does so in 33 %. `--physics stress` is to learn there; no student was trained with it yet.
+
+*As steps* is how edges were cut until then, as notches. Now they are planes (`concent_warp/deploy/cut_edges.py`), which
+no student was trained with.
 """
 
 
@@ -233,11 +256,12 @@ def page(rows: Sequence[Row], shapes: Sequence[Row] = ()) -> str:
     trials = [row for row in good if "world" in row]
     sizes = sorted({row["size"] for row in trained})
     episodes = sorted({row["episodes"] for row in trials})
-    about = ABOUT.format(size=" or ".join(map(str, sizes)), episodes=" or ".join(map(str, episodes)))
+    about = ABOUT.format(size=" or ".join(map(str, sizes)), episodes=", ".join(map(str, episodes)))
     parts = ["# Students that see", "Written by `benchmarks/distil/student.py`; do not edit.", about]
     for teacher in dict.fromkeys(row["teacher"] for row in trials):
         lines = [_line(variant, teacher, trials, trained) for variant in TITLES]
-        head = ["policy", "seeds", "in simulation", "95 %", "in Reality", "95 %", "samples", "time [s]"]
+        head = ["policy", "seeds", "in simulation", "95 %", "in the stress test", "95 %", "in Reality", "95 %"]
+        head += ["samples", "time [s]"]
         parts += [f"## Teacher `{teacher}`", table(head, [line for line in lines if line])]
     parts.append(NOTES)
     if shapes:

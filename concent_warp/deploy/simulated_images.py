@@ -34,10 +34,15 @@ from concent_warp.train.task.task import Task
 
 PATTERNS = 8
 """Patterns of a world, among which its geoms are divided."""
-VARIED = ("geom_rgba", "geom_size", "cam_pos", "cam_quat", "light_pos", "light_dir", "light_diffuse", "light_ambient")
+VARIED = (
+    "geom_rgba", "geom_size", "geom_pos", "cam_pos", "cam_quat", "light_pos", "light_dir", "light_diffuse",
+    "light_ambient",
+)  # fmt: skip
 """Fields of the model that differ between worlds."""
-SLIMMEST = 0.5
-"""Least size of a geom whose edges are cut [its size]."""
+WIDEST = 0.5
+"""Largest width of a cut [least size of the geom]."""
+FLATTEST = 1e-6
+"""Least size of what is drawn [m]: a bar of no width is not to be seen."""
 HEADLIGHT = {"ambient": [0.1] * 3, "diffuse": [0.15] * 3, "specular": [0.1] * 3}
 """Light from the camera itself, the same in all worlds."""
 
@@ -82,7 +87,8 @@ class RandomisedImages:
         of_objects = [[float(model.body(body).name in objects)] for body in model.geom_bodyid]
         self._of_objects = torch.tensor(of_objects, device=device)
         self._whole = torch.as_tensor(edges.whole, dtype=torch.int32, device=device)
-        self._shortened = torch.as_tensor(edges.shortened, dtype=torch.float32, device=device)
+        linear = (edges.size, edges.size_cut, edges.place, edges.place_cut)
+        self._parts = [torch.as_tensor(one, dtype=torch.float32, device=device) for one in linear]
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._middle = torch.as_tensor(data.xpos[list(task.objects)].mean(axis=0), dtype=torch.float32, device=device)
@@ -127,7 +133,7 @@ class RandomisedImages:
         nominal = self._nominal
         return [
             self._colours(nominal["geom_rgba"]),
-            self._sizes(nominal["geom_size"]),
+            *self._shapes(nominal["geom_size"], nominal["geom_pos"]),
             nominal["cam_pos"] + cfg.camera_position * self._signed(*nominal["cam_pos"].shape),
             multiply_quaternions(
                 nominal["cam_quat"],
@@ -149,13 +155,22 @@ class RandomisedImages:
         moved = (nominal[..., :3] + change[:, bodies]).clamp(0, 1)
         return torch.cat([torch.where(replaced[:, bodies], other[:, bodies], moved), nominal[..., 3:]], dim=-1)
 
-    def _sizes(self, nominal: torch.Tensor) -> torch.Tensor:
-        """Return sizes of the geoms, those of the objects changed and their edges cut, shape (N, ngeom, 3)."""
+    def _shapes(self, size: torch.Tensor, place: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return sizes and places of the geoms, those of the objects changed and their edges cut, shape (N, ngeom, 3).
+
+        Args:
+            size: Sizes, of parts that of the whole.
+            place: Places, likewise.
+        """
         cfg = self._looks
-        changed = nominal * (1 + cfg.size * self._signed(*nominal.shape) * self._of_objects)
-        cut = self._uniform(cfg.chamfer, self._worlds, 1, 1) * self._shortened
+        changed = size * (1 + cfg.size * self._signed(*size.shape) * self._of_objects)
         whole = changed[:, self._whole.long()]
-        return torch.maximum(whole - cut, SLIMMEST * whole)
+        least = whole.masked_fill(whole <= 0, torch.inf).amin(dim=-1, keepdim=True)
+        cut = torch.minimum(self._uniform(cfg.chamfer, self._worlds, 1, 1), WIDEST * least)
+        by_size, by_cut, place_by_size, place_by_cut = self._parts
+        sizes = torch.einsum("gij,ngj->ngi", by_size, whole) + cut * by_cut
+        drawn = torch.where(size > 0, sizes.clamp(min=FLATTEST), sizes)
+        return drawn, place + torch.einsum("gij,ngj->ngi", place_by_size, whole) + cut * place_by_cut
 
     def _lamps(self, count: int) -> list[torch.Tensor]:
         """Return positions, directions, light and ambient light of the lamps, shape (N, lamps, 3) each."""

@@ -23,8 +23,10 @@ def test_a_stopped_benchmark_goes_on_and_its_page_has_what_was_measured(tmp_path
     parts = (
         "student 0 training",
         "student 0 simulation",
+        "student 0 stress",
         "student 0 reality",
         "teacher 0 simulation",
+        "teacher 0 stress",
         "teacher 0 reality",
     )
     assert set(rows) == {f"shape_sorter {part}" for part in parts}

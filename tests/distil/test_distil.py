@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -61,6 +62,21 @@ def test_stages_follow_one_another_earlier_than_in_the_teachers_training_and_nev
         environment = Distillation(teacher, cfg, lambda _: None).environment("cpu", 0)  # pyright: ignore
         assert environment._settings.chain.tolerance == expected
         assert bool(environment._from_start.all())
+
+
+def test_the_physics_of_the_stress_test_can_be_learnt_in(teacher):
+    usual, stress = (trainer(teacher, replace(TINY, physics=physics)) for physics in ("training", "stress"))
+    steps = [made.environment.physics.model.opt.timestep for made in (usual, stress)]  # pyright: ignore
+    assert steps[1] == pytest.approx(steps[0] / teacher.run.cfg.stress.refine)
+    boxes = [one.environment.task.compiled.geom_type == mujoco.mjtGeom.mjGEOM_BOX for one in (usual, stress)]
+    solid = [
+        (made.environment.task.compiled.geom_contype > 0) & box
+        for made, box in zip((usual, stress), boxes, strict=True)
+    ]
+    assert solid[1].sum() > solid[0].sum()
+    with torch.no_grad():
+        stress._collect(beta=0.0)
+    assert bool(stress.samples.action[:2].isfinite().all())
 
 
 def test_a_distillation_that_stopped_continues_exactly(teacher, student, tmp_path):

@@ -239,6 +239,9 @@ class DistilCfg:
     tolerance: Positive = 0.01
     """In chains of stages, least `ChainCfg.tolerance` [m]: a student does not observe the stage. A teacher that waits
     for a grasp as exact as its own labels the same images otherwise, by whether the student's was within it."""
+    physics: Literal["training", "stress"] = "training"
+    """Physics in which the student learns: the teacher's training's, or that of its stress test, in which edges catch,
+    several times slower. In the former a block that is some millimetres beside its hole slides in."""
     dagger: DaggerCfg = field(default_factory=DaggerCfg)
     """The training."""
     images: ImagesCfg = field(default_factory=ImagesCfg)

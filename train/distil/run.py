@@ -22,6 +22,7 @@ from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, load_checkpoint
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.sample import sample_reset_states
+from concent_warp.train.trials.stress import stressed, with_shapes
 
 TEACHER = "teacher"
 """Folder of the teacher in the run folder of a student."""
@@ -39,20 +40,25 @@ class Distillation:
     """Makes the cameras of an environment's worlds."""
 
     def environment(self, device: str, seed: int) -> Environment:
-        """Return the worlds of a training, as the teacher was trained in them but for `free` and `tolerance`."""
+        """Return the worlds of a training, as the teacher was trained in them but for what the settings say."""
         run, cfg = self.teacher.run, self.cfg
-        settings = replace(run.cfg.environment, worlds=cfg.dagger.worlds)
+        stress = run.cfg.stress if cfg.physics == "stress" else None
+        settings = run.cfg.environment if stress is None else stressed(run.cfg.environment, stress)
         settings = replace(
             settings,
+            worlds=cfg.dagger.worlds,
             reset=replace(settings.reset, free=cfg.free),
             chain=replace(settings.chain, tolerance=max(cfg.tolerance, settings.chain.tolerance)),
         )
-        if (buffers := self.teacher.weights.get("buffers")) is not None:
+        if stress is None and (buffers := self.teacher.weights.get("buffers")) is not None:
             settings = replace(settings, nconmax=int(buffers[0]), njmax=int(buffers[1]))
-        task = run.task()
+        task = run.task(settings)
         check_worlds(task, settings, device)
         states = sample_reset_states(task, settings.reset, seed, count=cfg.states, device=device)
-        return make_environment(task, settings, states, device=device, seed=seed)
+        if stress is None:
+            return make_environment(task, settings, states, device=device, seed=seed)
+        physical, options = with_shapes(task, stress), {"refine": stress.refine, "time_constant": stress.time_constant}
+        return make_environment(physical, settings, states, device=device, seed=seed, **options)
 
     def save(self, folder: Path) -> None:
         """Write the settings and the teacher to a run folder."""

@@ -51,7 +51,7 @@ class StressTest:
         self._episodes = cfg.stress.episodes if episodes is None else episodes
         self._cfg = stressed(cfg.environment, cfg.stress)
         self._task = make_task(self._cfg)
-        self._physical = (with_nominal_shapes(self._task) if cfg.stress.shapes == "nominal" else None) or self._task
+        self._physical = with_shapes(self._task, cfg.stress)
         self._seed = SEED + cfg.seed if seed is None else OTHER_SEED + seed
         reset = replace(self._cfg.reset, demonstrated=0.0, grasp_turn=0.0, free=1.0)  # as in evaluations
         self._states = sample_reset_states(self._task, reset, self._seed, count=self._episodes)
@@ -81,6 +81,11 @@ class StressTest:
             warnings.warn("contacts were dropped in the stress test: the episodes are repeated", stacklevel=2)
             self._cfg = replace(self._cfg, nconmax=2 * buffers[0], njmax=2 * buffers[1])
             self._made = None
+
+
+def with_shapes(task: Task, stress: StressCfg) -> Task:
+    """Return a task whose objects have the shapes of the test."""
+    return (with_nominal_shapes(task) if stress.shapes == "nominal" else None) or task
 
 
 def stressed(cfg: EnvironmentCfg, stress: StressCfg) -> EnvironmentCfg:
