@@ -62,8 +62,8 @@ colours, patterns, lights, camera poses and delays, labelled by the teacher in t
 In Reality it acts by Reality's own cameras: other textures, lights and colours, vignette, blur, noise of 2/255,
 mounting errors of up to 3 mm and 0.5 degrees, 20 to 70 ms of latency; friction, masses and gains vary as for policies
 that observe the state, and nothing of Reality was seen in training. Each row is {episodes} episodes from
-initial states that were not trained from; the seeds of a row are pooled, intervals are Wilson's. Time is that of one distillation
-without the start of the simulator.
+initial states that were not trained from; the seeds of a row are pooled, intervals are Wilson's. Time is that of one
+distillation without the start of the simulator.
 
 In insertion alone the box is always at one place and the block is in the hand: joint readings and the leads of the
 commands tell a blind student most of what it needs. In the whole task both objects are placed at random.
