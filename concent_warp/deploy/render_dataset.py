@@ -155,7 +155,7 @@ def _check_randomised(cfg: RenderCfg) -> None:
     """
     given = {"networks": cfg.networks, "splats": cfg.splats, "figure": cfg.figure, "show": cfg.show != "visual"}
     if cfg.randomise and (others := [name for name, value in given.items() if value]):
-        expected = "neither networks, splats, figure of layers, nor spheres"
+        expected = "no networks, splats, figure of layers or spheres"
         raise RenderError("random looks are of the ray-traced scene alone", expected=expected, found=", ".join(others))
 
 

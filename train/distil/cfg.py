@@ -234,11 +234,12 @@ class DistilCfg:
     states: Count | None = None
     """Initial states of the episodes; as many as in the teacher's training by default."""
     free: Share = 0.5
-    """In chains of stages, share of these that are of the whole task, see `ResetCfg.free`: a student begins there, and
-    has the most to see there."""
+    """In chains of stages, share of the initial states at the start of the whole task, as `ResetCfg.free`: there a
+    student begins, and the objects are anywhere."""
     tolerance: Positive = 0.01
-    """In chains of stages, least `ChainCfg.tolerance` [m]: a student does not observe the stage. A teacher that waits
-    for a grasp as exact as its own labels the same images otherwise, by whether the student's was within it."""
+    """In chains of stages, least distance of contact pairs at which a stage ends [m], as `ChainCfg.tolerance`: a
+    student does not observe the stage, and a teacher that waits for a grasp as exact as its own gives the same images
+    two labels."""
     physics: Literal["training", "stress"] = "training"
     """Physics in which the student learns: the teacher's training's, or that of its stress test, in which edges catch,
     several times slower. In the former a block that is some millimetres beside its hole slides in."""
