@@ -60,7 +60,7 @@ def test_the_edges_are_left_out_and_the_faces_stay(kind, size, edge, faces):
     assert all(inside(model, edges, CUT, shrunk * np.array(face, float)) for face in faces)
 
 
-def test_a_box_with_cut_edges_is_what_three_planes_of_each_edge_leave_but_for_its_corners():
+def test_a_box_with_cut_edges_is_what_a_plane_at_each_edge_leaves_but_for_its_corners():
     spec = scene("box", "0.02 0.03 0.04")
     parts = add_parts(spec, ["thing"])
     model = spec.compile()

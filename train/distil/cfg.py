@@ -241,8 +241,9 @@ class DistilCfg:
     student does not observe the stage, and a teacher that waits for a grasp as exact as its own gives the same images
     two labels."""
     physics: Literal["training", "stress"] = "training"
-    """Physics in which the student learns: the teacher's training's, or that of its stress test, in which edges catch,
-    several times slower. In the former a block that is some millimetres beside its hole slides in."""
+    """Physics in which the student learns: the teacher's training's, or that of its stress test, in which edges catch
+    and steps are shorter (`StressCfg.refine`). In the former a block that is some millimetres beside its hole slides
+    in."""
     dagger: DaggerCfg = field(default_factory=DaggerCfg)
     """The training."""
     images: ImagesCfg = field(default_factory=ImagesCfg)
