@@ -132,7 +132,7 @@ class RenderCfg:
     """
 
     episodes: Count = 20
-    """Number of initial states of the policy; one episode starts from each."""
+    """Initial states of the policy, one episode from each."""
     keep: Literal["successes", "all"] = "successes"
     """Which episodes of a policy go into the data set."""
     task: str | None = None
@@ -150,8 +150,7 @@ class RenderCfg:
     show: Literal["visual", "spheres"] = "visual"
     """Geometry of the objects in the raw image: visual shapes or contact spheres."""
     randomise: bool = False
-    """Ray-trace a policy's episodes under random looks, which are sampled for each episode (`looks`): for policies
-    that are to see what no model looks like, without networks and splats."""
+    """Ray-trace each episode of a policy under random looks; without networks and splats."""
     rate: Annotated[int, Bounds(1, 1000)] = 10
     """Frame rate of a rendered recording [Hz]; a policy's episodes have its control rate."""
     worlds: Worlds = 8

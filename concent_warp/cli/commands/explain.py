@@ -65,8 +65,6 @@ def run(arguments: Arguments) -> Explanation:
     from concent_warp.train.policy.load import load_policy
 
     policy = load_policy(arguments.policy).scaled(arguments.action_scale, arguments.setpoint_lead_scale)
-    if arguments.out is not None:
-        make_folder(arguments.out)
     found = _explained(arguments, policy, recordings)
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
