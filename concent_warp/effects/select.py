@@ -7,12 +7,13 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
+from concent_warp.scene.sensor_frame import sensor_frame
+
 JOINT = mujoco.mjtJoint
 SENSOR = mujoco.mjtSensor
 SINGLE = (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_SLIDE))
 POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
-BODIES = (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY))
 
 
 def element_name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:
@@ -165,7 +166,7 @@ def shown_dofs(m: mujoco.MjModel, sensors: Iterable[str]) -> np.ndarray:
 
 def shown_free_joint(m: mujoco.MjModel, sensor: int) -> int | None:
     """Return the free joint of the body whose position or orientation a sensor shows; None where there is none."""
-    if int(m.sensor_objtype[sensor]) not in BODIES:
+    if (frame := sensor_frame(m, sensor)) is None:
         return None
-    joint = int(m.body_jntadr[m.sensor_objid[sensor]])
+    joint = int(m.body_jntadr[frame.body])
     return joint if joint >= 0 and m.jnt_type[joint] == int(JOINT.mjJNT_FREE) else None

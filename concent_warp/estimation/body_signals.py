@@ -14,6 +14,7 @@ from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame
 from concent_warp.estimation.signals import MeasuredBody, OrientationSignal, Signal
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.recording.recording import Channel
+from concent_warp.scene.sensor_frame import sensor_frame
 
 if TYPE_CHECKING:
     from concent_warp.recording.recording import Demonstration
@@ -99,10 +100,10 @@ def spline_bodies(m: mujoco.MjModel, demonstration: Demonstration, cfg: Smoothin
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
         kind = int(m.sensor_type[row]) if row >= 0 else -1
-        if kind in (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT)) and m.sensor_refid[row] < 0:
-            frame = _frame_in_body(m, row)
+        if kind in (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT)):
+            frame = sensor_frame(m, row)
             if frame is not None:
-                posed.setdefault(frame[0], {}).setdefault(kind, (channel, frame[1], frame[2]))
+                posed.setdefault(frame.body, {}).setdefault(kind, (channel, frame.offset, frame.turn))
     for body, channels in posed.items():
         joint = m.body_jntadr[body]
         if joint < 0 or m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE or int(SENSOR.mjSENS_FRAMEPOS) not in channels:
@@ -124,19 +125,3 @@ def spline_bodies(m: mujoco.MjModel, demonstration: Demonstration, cfg: Smoothin
             addresses = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
             found[body] = MeasuredBody(name, body, *addresses, position, orientation)
     return tuple(found[body] for body in sorted(found))
-
-
-def _frame_in_body(m: mujoco.MjModel, row: int) -> tuple[int, np.ndarray, Rotation] | None:
-    """Return the body of a frame sensor, the frame's origin on it [m, body frame] and rotation from frame to body."""
-    target, kind = int(m.sensor_objid[row]), int(m.sensor_objtype[row])
-    if kind == mujoco.mjtObj.mjOBJ_XBODY:
-        return target, np.zeros(3), Rotation.identity()
-    if kind == mujoco.mjtObj.mjOBJ_BODY:
-        body, offset, turn = target, m.body_ipos[target], m.body_iquat[target]
-    elif kind == mujoco.mjtObj.mjOBJ_SITE:
-        body, offset, turn = int(m.site_bodyid[target]), m.site_pos[target], m.site_quat[target]
-    elif kind == mujoco.mjtObj.mjOBJ_GEOM:
-        body, offset, turn = int(m.geom_bodyid[target]), m.geom_pos[target], m.geom_quat[target]
-    else:
-        return None
-    return body, np.array(offset), Rotation.from_quat(turn, scalar_first=True)

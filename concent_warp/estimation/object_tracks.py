@@ -8,7 +8,7 @@ points serves as well: points on the body's surface are then carried by the meas
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
@@ -19,6 +19,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.perception.rigid_motion import kabsch
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.replay import commands, initial_state, step_count
 
 
@@ -137,26 +138,66 @@ def measured_pose(
     orientation = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEQUAT)
     if position is None or orientation is None:
         return None
+    rotation = _rotations(orientation, position.time)
+    return None if rotation is None else (position.time, position.value, rotation)
+
+
+def frame_channel(
+    model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor
+) -> Channel | None:
+    """Return what was measured of a body's frame by a world-frame sensor of a kind, or None.
+
+    Sensors of another frame on the body, such as a marker's site, a geom or the centre of mass, count where none
+    measures the body's own: orientations are turned to the body's frame, positions moved to its origin by the
+    orientations measured at the same time. Velocities are those of the same origin only.
+    """
+    found = _frame_channels(model, demonstration, body, kind)
+    for frame, channel in found:
+        if frame.is_body:
+            return channel
+    for frame, channel in found:
+        if kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
+            valid = np.isfinite(channel.value).all(axis=1)
+            value = np.full(channel.value.shape, np.nan)
+            turned = Rotation.from_quat(channel.value[valid], scalar_first=True) * frame.turn.inv()
+            value[valid] = turned.as_quat(scalar_first=True)
+            return replace(channel, value=value)
+        if not frame.is_beside:
+            return channel
+        if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
+            turned = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEQUAT)
+            if turned is not None and (rotation := _rotations(turned, channel.time)) is not None:
+                return replace(channel, value=channel.value - rotation.apply(frame.offset))
+    return None
+
+
+def _frame_channels(
+    model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor
+) -> list[tuple[SensorFrame, Channel]]:
+    """Return the measured channels of world-frame sensors of a kind on a body, each with its frame."""
+    row, found = model.body(body).id, []
+    for name, channel in demonstration.measured.items():
+        sensor = model.sensor(name).id
+        if int(model.sensor_type[sensor]) != int(kind):
+            continue
+        frame = sensor_frame(model, sensor)
+        if frame is not None and frame.body == row:
+            found.append((frame, channel))
+    return found
+
+
+def _rotations(orientation: Channel, time: np.ndarray) -> Rotation | None:
+    """Return measured orientations at other times (T,) [s], along the shorter way; None where none was measured.
+
+    Before the first and after the last one they stay.
+    """
     valid = np.isfinite(orientation.value).all(axis=1)
     if not valid.any():
         return None
     turn, clock = Rotation.from_quat(orientation.value[valid], scalar_first=True), orientation.time[valid]
     if len(clock) == 1:
         turn, clock = Rotation.concatenate([turn, turn]), np.array([clock[0], clock[0] + 1.0])
-    return position.time, position.value, Slerp(clock, turn)(np.clip(position.time, clock[0], clock[-1]))
-
-
-def frame_channel(
-    model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor
-) -> Channel | None:
-    """Return the measured channel of a world-frame sensor of a kind on a body's frame, or None."""
-    row = model.body(body).id
-    for name, channel in demonstration.measured.items():
-        sensor = model.sensor(name)
-        on_body = int(model.sensor_objtype[sensor.id]) == int(mujoco.mjtObj.mjOBJ_XBODY)
-        if on_body and int(model.sensor_type[sensor.id]) == int(kind) and model.sensor_objid[sensor.id] == row:
-            return channel
-    return None
+    return Slerp(clock, turn)(np.clip(time, clock[0], clock[-1]))
 
 
 def observed_states(model: mujoco.MjModel, segment: Segment, time: np.ndarray, qpos: np.ndarray) -> np.ndarray:

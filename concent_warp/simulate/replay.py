@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
+from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.engine import Contacts, Engine, Rollout, Variants
 
 if TYPE_CHECKING:
@@ -91,27 +93,33 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
     if demonstration.qpos is not None:
         return np.array(demonstration.qpos, dtype=float), qvel
     qpos = model.qpos0.copy()
+    framed: list[tuple[int, SensorFrame, np.ndarray]] = []
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
         known = np.isfinite(channel.value)
         first = channel.value[known.all(axis=1)]
         if row < 0 or not known.any():
             continue
-        kind, target = model.sensor_type[row], model.sensor_objid[row]
+        kind = mujoco.mjtSensor(int(model.sensor_type[row]))
         if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
-            qpos[model.jnt_qposadr[target]] = first[0, 0]
+            qpos[model.jnt_qposadr[model.sensor_objid[row]]] = first[0, 0]
             continue
-        if int(model.sensor_objtype[row]) not in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY):
+        frame = sensor_frame(model, row)
+        joint = -1 if frame is None else model.body_jntadr[frame.body]
+        if frame is None or joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             continue
-        joint = model.body_jntadr[target]
-        if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-            continue
-        address = model.jnt_qposadr[joint]
+        address = int(model.jnt_qposadr[joint])
         if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
-            for k in np.flatnonzero(known.any(axis=0)):
-                qpos[address + k] = channel.value[known[:, k], k][0]
+            value = [channel.value[k, i][0] if (k := known[:, i]).any() else np.nan for i in range(3)]
+            framed.append((address, frame, np.array(value)))
         elif kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT and len(first):
-            qpos[address + 3 : address + 7] = first[0] / np.linalg.norm(first[0])
+            turned = Rotation.from_quat(first[0], scalar_first=True) * frame.turn.inv()
+            qpos[address + 3 : address + 7] = turned.as_quat(scalar_first=True)
+    # Of several frames on a body, its own says where it is.
+    for address, frame, value in sorted(framed, key=lambda f: f[1].is_body):
+        place = value - Rotation.from_quat(qpos[address + 3 : address + 7], scalar_first=True).apply(frame.offset)
+        seen = np.isfinite(place)
+        qpos[address : address + 3][seen] = place[seen]
     return qpos, qvel
 
 
