@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Annotated
 import mujoco
 import numpy as np
 
-from concent_warp.checks import Bounds, Count, Positive, PositiveDuration
+from concent_warp.checks import Bounds, Count, Positive, PositiveDuration, Share
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState, partial_state
 from concent_warp.estimation.sample_noise import covariance_std, relative_whitening, whitened
 from concent_warp.estimation.state_estimator import StateEstimator
+from concent_warp.scene.sensor_frame import sensor_frame
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
 if TYPE_CHECKING:
@@ -85,6 +86,17 @@ class ObservationCfg:
     min_scatter: Positive = 0.1
     """Standard deviation along a direction of the residuals below which scatter is neglected [-]: a hundredth of the
     noise's variance."""
+    impact_error: Share = 0.0
+    """Standard deviation of each component of the velocity after an impact that no contact law foretells, over the
+    change of the velocity [-], see `impact_deviations`; 0 for none."""
+    impact_flight: PositiveDuration = 0.02
+    """Time that a body has flown before an impact [s]; shorter hops are the chatter of a contact."""
+    impact_duration: PositiveDuration = 0.02
+    """Time after which an impact is over where the body stays in contact [s]: several time constants of a contact."""
+    impact_acceleration: Positive = 0.5
+    """Acceleration beside gravity, in units of it, above which a body touches something [-]."""
+    impact_velocity: Positive = 0.05
+    """Change of the velocity from which a contact counts as an impact [m/s]."""
     default_position_noise: Positive = 1e-3
     """Noise of positions for which it is neither stated nor estimable [m or rad]: of a typical motion capture."""
     default_noise: Positive = 1e-2
@@ -283,9 +295,9 @@ def start_spread(
                     dof = int(m.jnt_dofadr[m.wrap_objid[w]])
                     seen(slice(dof, dof + 1), std)
         elif kind in (int(mujoco.mjtSensor.mjSENS_FRAMEPOS), int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)):
-            if int(m.sensor_objtype[row]) not in (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY)):
+            if (frame := sensor_frame(m, row)) is None:
                 continue
-            joint = int(m.body_jntadr[target])
+            joint = int(m.body_jntadr[frame.body])
             if joint < 0 or m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
                 continue
             dof = int(m.jnt_dofadr[joint]) + 3 * (kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))

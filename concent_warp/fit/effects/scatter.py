@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.fit.effects.impacts import impact_deviations
 from concent_warp.fit.effects.observation import NumericalScatter, ObservationCfg, Window
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.simulate.engine import Variants
@@ -50,7 +51,7 @@ def with_scatter(
     found = list(windows)
     for k in rough:
         seen = np.array([prediction.observed(k, next(courses).reader, trial.values) for trial in trials[k]])
-        found[k] = replace(found[k], scatter=_scatter(seen, prediction, cfg))
+        found[k] = replace(found[k], scatter=_scatter(seen, impact_deviations(prediction, k, cfg), prediction, cfg))
     return found
 
 
@@ -96,13 +97,22 @@ def _touching_dofs(m: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     return np.isin(m.body_rootid[m.dof_bodyid], touching)
 
 
-def _scatter(residuals: np.ndarray, prediction: Prediction, cfg: ObservationCfg) -> NumericalScatter | None:
-    """Return the scatter of the residuals (K, count) of simulations that should agree; None where there is little."""
+def _scatter(
+    residuals: np.ndarray, by_impacts: np.ndarray, prediction: Prediction, cfg: ObservationCfg
+) -> NumericalScatter | None:
+    """Return the scatter of a window's residuals; None where there is little.
+
+    Args:
+        residuals: Those of simulations that should agree, shape (K, count).
+        by_impacts: See `impact_deviations`.
+        prediction: What simulated them.
+        cfg: Settings.
+    """
     most = prediction.cfg.max_residual
     valid = residuals[(np.abs(residuals) < most).all(axis=1)]
-    if len(valid) < max(cfg.scatter_samples / 2, 2):
-        return None
-    deviations = (valid - valid.mean(axis=0)).T / np.sqrt(len(valid) - 1)
+    deviations = by_impacts
+    if len(valid) >= max(cfg.scatter_samples / 2, 2):
+        deviations = np.hstack([(valid - valid.mean(axis=0)).T / np.sqrt(len(valid) - 1), by_impacts])
     directions, size, _ = np.linalg.svd(deviations, full_matrices=False)
     kept = size > cfg.min_scatter
     return NumericalScatter(directions[:, kept] * size[kept]) if kept.any() else None

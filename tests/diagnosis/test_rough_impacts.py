@@ -1,0 +1,96 @@
+"""Diagnoses of a ball whose rebounds differ from any law of contact, each by itself, as those of real balls do."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import mujoco
+import numpy as np
+
+import concent_warp as cw
+from concent_warp.diagnosis.cfg import SearchCfg
+from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+
+STEP, NOISE, TURN_NOISE, SECONDS, RATE = 0.001, 4e-4, 4e-3, 0.6, 100
+RADIUS, MASS, DRAG = 0.03, 0.02, 0.001
+"""Radius [m], mass [kg] and resistance over the square of the speed [N s^2/m^2] of the ball."""
+SCENE = f"""
+<mujoco>
+  <option timestep="{STEP}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 0.1" solref="-40000 -20" friction="0.3"/>
+    <body name="ball" pos="0 0 1">
+      <freejoint/>
+      <geom name="ball" type="sphere" size="{RADIUS}" mass="{MASS}" solref="-40000 -20" friction="0.3"/>
+    </body>
+  </worldbody>
+  <sensor>
+    <framepos name="place" objtype="body" objname="ball"/>
+    <framequat name="orientation" objtype="body" objname="ball"/>
+  </sensor>
+</mujoco>"""
+CANDIDATES = ("air_drag", "wind", "gravity_tilt", "contact_compliance", "sliding_friction", "inertia", "time_base")
+
+
+def thrown(drag: float, error: float, seed: int) -> Demonstration:
+    """Return a throw that rebounds once or twice.
+
+    Args:
+        drag: Resistance over the square of the speed [N s^2/m^2].
+        error: Standard deviation of the velocity after an impact over its change [-].
+        seed: Of the throw, of its impacts and of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    m = mujoco.MjModel.from_xml_string(SCENE)
+    d = mujoco.MjData(m)
+    d.qpos[2] = rng.uniform(0.35, 0.6)
+    d.qvel[:3], d.qvel[3:] = rng.uniform([1.5, -0.5, -1.0], [3.0, 0.5, 0.5]), rng.normal(0, 6, 3)
+    rows, before = [], None
+    for _ in range(round(SECONDS / STEP) + 1):
+        rows.append(np.concatenate([d.qpos, d.qvel]))
+        d.xfrc_applied[1, :3] = -drag * np.linalg.norm(d.qvel[:3]) * d.qvel[:3]
+        mujoco.mj_step(m, d)
+        if d.ncon and before is None:
+            before = rows[-1][7:10].copy()
+        elif not d.ncon and before is not None:
+            change = float(np.linalg.norm(d.qvel[:3] - before))
+            d.qvel[:3] += error * change * rng.normal(size=3)
+            d.qvel[3:] += error * change / RADIUS * rng.normal(size=3)
+            before = None
+    path = np.array(rows[:: round(1 / RATE / STEP)])
+    time = np.arange(len(path)) / RATE
+    turned = path[:, 3:7] + TURN_NOISE / 2 * rng.normal(size=(len(path), 4))
+    seen = {
+        "place": Channel(time, path[:, :3] + NOISE * rng.normal(size=(len(path), 3)), NOISE),
+        "orientation": Channel(time, turned / np.linalg.norm(turned, axis=1, keepdims=True), TURN_NOISE),
+    }
+    return Demonstration(f"throw_{seed}", measured=seen)
+
+
+@cache
+def throws(drag: float, error: float) -> Recording:
+    return Recording(SCENE, tuple(thrown(drag, error, seed) for seed in range(5)))
+
+
+def diagnosed(recording: Recording, impact_error: float | None = None) -> Diagnosis:
+    search = SearchCfg() if impact_error is None else SearchCfg(impact_error=impact_error)
+    cfg = cw.DiagnoseCfg(jobs=1, explain=False, effects=CANDIDATES, search=search)
+    return cw.diagnose(cw.Model.from_recording(recording), recording, cfg)
+
+
+def test_drag_is_found_beside_rebounds_that_no_law_foretells():
+    found = diagnosed(throws(DRAG, 0.01))
+    assert found.verdict == "effect"
+    assert [f.name for f in found.accepted] == ["air_drag"]
+    assert any("impacts" in sentence for sentence in found.issues)
+    # Without an allowance for them they count as missing physics.
+    strict = diagnosed(throws(DRAG, 0.01), 0.0)
+    assert (strict.verdict, [f.name for f in strict.accepted]) != ("effect", ["air_drag"])
+
+
+def test_rebounds_that_are_as_the_model_has_them_need_no_allowance():
+    found = diagnosed(throws(DRAG, 0.0))
+    assert found.verdict == "effect"
+    assert [f.name for f in found.accepted] == ["air_drag"]
+    assert not any("impacts" in sentence for sentence in found.issues)
