@@ -2,6 +2,15 @@
 
 python -m benchmarks.independent.bullet_world  # residual of the nominal model over the noise, and with the true effects
 python -m benchmarks.independent.bullet_world --kinds null --rigs lift shove
+
+The table is that of `drake_world`. Making a data set needs Bullet (the extra `benchmarks`).
+
+The ratio of the nominal model is 1.0 to 1.2 in `shove`, `lob` and `ramp`, 1.4 in `poke`, and 1.5 to 2.0 in `lift` and
+`cart`, where nothing is hidden: sampled control with a torque that is held, friction with presliding, MuJoCo's step, and
+tolerances. In `cart` it depends on the tolerance of the pendulum's length, which shifts the phase of a free swing; there
+are seeds with 3. With true effects it is about the same, but larger in two cases: with play in the gears of `lift` (4 to
+7, against 11 to 30 without), for teeth meet otherwise than in the library; and with joint friction in `poke`, where
+slides rest most of the time, at offsets that depend on how friction holds them.
 """
 
 from __future__ import annotations
@@ -35,7 +44,7 @@ SINGLES: dict[str, dict[str, Values]] = {
     },
     "poke": {
         "sliding_friction": (0.4, 0.6),
-        "joint_friction": (0.5, 1.5),
+        "joint_friction": (0.3, 0.7),
         "actuator_lag": (0.006, 0.02),
         "frame_offset": (0.0015, 0.004),
         "latency": (0.012, 0.03),
@@ -43,7 +52,7 @@ SINGLES: dict[str, dict[str, Values]] = {
     "lob": {
         "air_drag": (1.0, 2.5),
         "wind": (2.0, 4.0),
-        "contact_compliance": (0.14, 0.19),
+        "contact_compliance": (0.13, 0.16),
         "length_scale": (0.012, 0.03),
     },
     "ramp": {
@@ -69,11 +78,11 @@ OUTSIDES: tuple[tuple[str, str, float], ...] = (
     ("lift", "warming", 0.2),
     ("cart", "faltering", 1.0),
     ("poke", "cogging", 1.5),
-    ("shove", "magnet", 0.15),
-    ("shove", "sticky_spot", 0.3),
-    ("lob", "gust", 0.04),
+    ("shove", "magnet", 0.3),
+    ("shove", "sticky_spot", 0.6),
+    ("lob", "gust", 0.06),
     ("ramp", "magnet", 0.02),
-    ("ramp", "sticky_spot", 0.05),
+    ("ramp", "sticky_spot", 0.1),
 )
 """Rig, what the library lacks, and its magnitude in the units of `foreign.outside`."""
 BULLET = ForeignWorld("bullet", BULLET_RIGS, SINGLES, PAIRS, OUTSIDES)

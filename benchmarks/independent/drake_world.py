@@ -4,8 +4,9 @@ python -m benchmarks.independent.drake_world  # residual of the nominal model ov
 python -m benchmarks.independent.drake_world --kinds null --rigs swing launch
 
 The table has, for each data set, the time to make its recording and the root mean square of residual over noise in the
-worst channel (`benchmarks.diagnose.hidden_effects_residual`, with refitted initial states): of the nominal model, and of
-the nominal model with the effects of the library at the true values. Making a data set needs Drake (extra `benchmarks`).
+worst channel (`benchmarks.diagnose.hidden_effects_residual`, with refitted initial states): of the nominal model, and
+of the nominal model with the library's effects at the true values. Making a data set needs Drake (the extra
+`benchmarks`).
 
 The nominal models are not exact where nothing is hidden either. The ratio of `swing` and `reach` is 1.4 to 1.5 (sampled
 control with a torque that is held, friction with presliding, tolerances, quantisation), of `launch`, `roll` and `toss`

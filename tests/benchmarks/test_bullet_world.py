@@ -172,7 +172,7 @@ def test_masses_of_the_world_are_those_of_the_scene(name):
     rig = BULLET_RIGS[name]
     model = rig.scene.model
     with built(rig, nominal_physics(rig)) as world:
-        links = {rig.body: (world.body, -1)} if world.body is not None else {}
+        links: dict[str, tuple[int | None, int]] = {rig.body: (world.body, -1)} if rig.free else {}
         for link in world.joints.values():
             links[world.client.getJointInfo(world.arm, link)[12].decode()] = (world.arm, link)
         assert set(links) == {model.body(b).name for b in range(1, model.nbody)}
