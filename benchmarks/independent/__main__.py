@@ -50,7 +50,7 @@ class Args:
     rigs: tuple[str, ...] = ()
     """Rigs; all by default."""
     world: World | None = None
-    """One of the two worlds; both by default."""
+    """One of the worlds; all by default."""
     names: tuple[str, ...] = ()
     """Only data sets of these names."""
     locked: bool = False
@@ -124,11 +124,12 @@ def wanted(case: DataSet, args: Args) -> bool:
 def run(chosen: Sequence[DataSet], args: Args) -> None:
     """Diagnose what is not done yet."""
     pending = [c for c in chosen if not path(args.out, c.name).is_file()]
-    if any(c.world == "drake" for c in pending) and find_spec("pydrake") is None:
-        raise SystemExit(
-            "independent benchmark: the world on Drake needs the package drake, which is not installed; install the"
-            " extra concent-warp[benchmarks], or leave that world out with --world mujoco"
-        )
+    for world, module, package in (("drake", "pydrake", "drake"), ("bullet", "pybullet", "pybullet")):
+        if any(c.world == world for c in pending) and find_spec(module) is None:
+            raise SystemExit(
+                f"independent benchmark: the world on {world.capitalize()} needs the package {package}, which is not"
+                " installed; install the extra concent-warp[benchmarks], or leave that world out with --world mujoco"
+            )
     random.Random(0).shuffle(pending)  # what is done when it is stopped is a fair part of the whole
     done: dict[str, list[float]] = {}
     commit, begun = revision(), time.monotonic()

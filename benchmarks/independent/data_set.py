@@ -10,8 +10,10 @@ from typing import Literal
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
 
-World = Literal["mujoco", "drake"]
-WORLDS: tuple[World, ...] = ("mujoco", "drake")
+World = Literal["mujoco", "drake", "bullet"]
+WORLDS: tuple[World, ...] = ("mujoco", "drake", "bullet")
+ENGINES: dict[World, str] = {"mujoco": "MuJoCo", "drake": "Drake", "bullet": "Bullet"}
+"""What simulates a world."""
 Kind = Literal["null", "single", "outside", "pair", "geometry"]
 KINDS: tuple[Kind, ...] = ("null", "single", "outside", "pair", "geometry")
 """Nothing hidden; one effect of the library; one that the library lacks; two of the library at once; a contact geometry
@@ -32,7 +34,7 @@ class DataSet:
     """A recording to be made; the same each time."""
 
     name: str
-    """Unique over both worlds; in Drake's it begins with "drake-"."""
+    """Unique over all worlds; in those on other engines than MuJoCo it begins with their name."""
     world: World
     kind: Kind
     rig: str

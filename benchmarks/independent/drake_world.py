@@ -3,9 +3,10 @@
 python -m benchmarks.independent.drake_world  # residual of the nominal model over the noise, and with the true effects
 python -m benchmarks.independent.drake_world --kinds null --rigs swing launch
 
-The table has, for each data set, the time to make it and the root mean square of residual over noise in the worst
-channel (`benchmarks.diagnose.hidden_effects_residual`, with refitted initial states): of the nominal model, and of the
-nominal model with the library's effects at the true values. Making a data set needs Drake (the extra `benchmarks`).
+The table has, for each data set, the time to make its recording and the root mean square of residual over noise in the
+worst channel (`benchmarks.diagnose.hidden_effects_residual`, with refitted initial states): of the nominal model, and
+of the nominal model with the library's effects at the true values. Making a data set needs Drake (the extra
+`benchmarks`).
 
 The nominal models are not exact where nothing is hidden either. The ratio of `swing` and `reach` is 1.4 to 1.5 (sampled
 control with a torque that is held, friction with presliding, tolerances, quantisation), of `launch`, `roll` and `toss`
@@ -19,27 +20,12 @@ control with a torque that is held, friction with presliding, tolerances, quanti
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, replace
-
-import numpy as np
 import tyro
 
-from benchmarks.diagnose.hidden_effects_residual import ratios
-from benchmarks.independent.data_set import Data, DataSet, Kind, Size, Truth
-from benchmarks.independent.drake.hidden import INSIDE
-from benchmarks.independent.drake.outside import OUTSIDE
-from benchmarks.independent.drake.rig import true_physics
+from benchmarks.independent.data_set import Data, DataSet
 from benchmarks.independent.drake.rigs import DRAKE_RIGS
-from concent_warp.effects.registry import effect_class
-from concent_warp.model import Model
-from concent_warp.recording.recording import Channel, Recording
-from concent_warp.scene.scene import Scene
+from benchmarks.independent.foreign.world import Args, ForeignWorld, Values, print_residuals
 
-Values = tuple[float, float]
-HELD_OUT_SEED = 50_000
-"""Added to a data set's seed for motions, clocks and noise of its held-out recording."""
-NULL_SEEDS = (0, 1)
 SINGLES: dict[str, dict[str, Values]] = {
     "swing": {
         "joint_friction": (0.02, 0.05),
@@ -106,7 +92,7 @@ SINGLES: dict[str, dict[str, Values]] = {
         "gravity_tilt": (0.03, 0.07),
     },
 }
-"""Middle and large value of the main parameter of each effect, by rig, in the units of `drake.hidden`."""
+"""Middle and large value of the main parameter of each effect, by rig, in the units of `foreign.hidden`."""
 PAIRS: tuple[tuple[str, str, str], ...] = (
     ("swing", "joint_friction", "actuator_delay"),
     ("swing", "joint_damping", "mass"),
@@ -134,110 +120,19 @@ OUTSIDES: tuple[tuple[str, str, float], ...] = (
     ("bounce", "gust", 0.08),
     ("toss", "slosh", 0.3),
 )
-"""Rig, what the library lacks, and its magnitude in the units of `drake.outside`."""
+"""Rig, what the library lacks, and its magnitude in the units of `foreign.outside`."""
+DRAKE = ForeignWorld("drake", DRAKE_RIGS, SINGLES, PAIRS, OUTSIDES)
 
 
 def drake_sets() -> list[DataSet]:
-    """Return all data sets, in a fixed order, with names that differ.
-
-    Of the effects of a rig every other one has the large value, and every third one both; noise is stated in every
-    other data set of a kind.
-    """
-    found = [
-        DataSet(f"drake-{rig}-null-{seed}", "drake", "null", rig, {}, seed) for rig in DRAKE_RIGS for seed in NULL_SEEDS
-    ]
-    for rig, effects in SINGLES.items():
-        for k, (effect, values) in enumerate(effects.items()):
-            for j, size in enumerate(("middle", "large")):
-                if k % 3 == 0 or k % 2 == j:
-                    found.append(_set(rig, "single", {effect: values[j]}, size, 10 + k))
-    for k, (rig, first, second) in enumerate(PAIRS):
-        found.append(_set(rig, "pair", {e: SINGLES[rig][e][1] for e in (first, second)}, "large", 30 + k))
-    for k, (rig, effect, magnitude) in enumerate(OUTSIDES):
-        found.append(_set(rig, "outside", {effect: magnitude}, "large", 50 + k))
-    counts: dict[str, int] = {}
-    for k, case in enumerate(found):
-        counts[case.kind] = counts.get(case.kind, -1) + 1
-        found[k] = replace(case, noise_stated=counts[case.kind] % 2 == 0)
-    return found
-
-
-def _set(rig: str, kind: Kind, magnitudes: dict[str, float], size: Size, seed: int) -> DataSet:
-    name = f"drake-{rig}-{'+'.join(magnitudes)}-{size}"
-    return DataSet(name, "drake", kind, rig, magnitudes, seed, size=size)
+    """Return all data sets, in a fixed order, with names that differ."""
+    return DRAKE.sets()
 
 
 def make_drake(case: DataSet) -> Data:
     """Return the recordings of a data set, the user's scene, and the truth; the same each time."""
-    from benchmarks.independent.drake.recording import record_drake
-
-    rig = DRAKE_RIGS[case.rig]
-    physics = true_physics(rig, case.seed)
-    truth = tuple((INSIDE | OUTSIDE)[name](rig, physics, value) for name, value in case.magnitudes.items())
-    made = record_drake(rig, physics, case.seed, case.demonstrations, noise_stated=case.noise_stated)
-    held_out = record_drake(rig, physics, case.seed + HELD_OUT_SEED, 1)
-    return Data(made.recording, held_out.recording, rig.scene, truth)
-
-
-def with_starts(case: DataSet) -> tuple[Recording, Scene, tuple[Truth, ...]]:
-    """Return the recording of a data set with its noise, true initial states and no gaps, its scene, and the truth."""
-    from benchmarks.independent.drake.recording import record_drake
-
-    rig = DRAKE_RIGS[case.rig]
-    physics = true_physics(rig, case.seed)
-    truth = tuple((INSIDE | OUTSIDE)[name](rig, physics, value) for name, value in case.magnitudes.items())
-    made = record_drake(rig, physics, case.seed, case.demonstrations)
-    known = []
-    for d, start in zip(made.recording.demonstrations, made.starts, strict=True):
-        seen = {name: _without_gaps(channel) for name, channel in d.measured.items()}
-        begun = {} if start is None else {"qpos": start[0], "qvel": start[1]}
-        known.append(replace(d, measured=seen, **begun))
-    return replace(made.recording, demonstrations=tuple(known)), rig.scene, truth
-
-
-def _without_gaps(channel: Channel) -> Channel:
-    """Return the rows of a channel that have all values."""
-    rows = np.isfinite(channel.value).all(axis=1)
-    return replace(channel, time=channel.time[rows], value=channel.value[rows])
-
-
-def true_model(scene: Scene, truth: tuple[Truth, ...]) -> Model | None:
-    """Return the nominal model with the library's effects at the true values; None where it has none to add."""
-    if not truth or not all(t.known and t.parameters for t in truth):
-        return None
-    model = Model(scene)
-    for t in truth:
-        model = model.add(effect_class(t.effect)(*t.target), t.parameters)
-    return model
-
-
-@dataclass(frozen=True)
-class Args:
-    """Command line."""
-
-    kinds: tuple[Kind, ...] = ("null", "single", "pair", "outside")
-    rigs: tuple[str, ...] = tuple(DRAKE_RIGS)
-    contains: str = ""
-    """Only data sets whose names contain this."""
-
-
-def main(args: Args) -> None:
-    """Print the residual of the nominal model on each data set."""
-    print(f"{'data set':52s} {'make':>6s} {'nominal':>8s} {'truth':>7s}  nominal, by channel")
-    for case in drake_sets():
-        if case.kind not in args.kinds or case.rig not in args.rigs or args.contains not in case.name:
-            continue
-        began = time.perf_counter()
-        make_drake(case)
-        spent = time.perf_counter() - began
-        recording, scene, truth = with_starts(case)
-        ratio = ratios(Model(scene), recording)
-        model = true_model(scene, truth)
-        best = "-" if model is None else f"{max(ratios(model, recording).values()):.2f}"
-        worst = sorted(ratio.items(), key=lambda item: -item[1])
-        listed = ", ".join(f"{name} {value:.1f}" for name, value in worst[:4])
-        print(f"{case.name:52s} {spent:5.1f}s {worst[0][1]:8.2f} {best:>7s}  {listed}", flush=True)
+    return DRAKE.make(case)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    print_residuals(DRAKE, tyro.cli(Args))

@@ -1,4 +1,4 @@
-"""Encoders and a pose tracker with the imperfections of real ones, for both worlds.
+"""Encoders and a pose tracker with the imperfections of real ones, for all worlds.
 
 White and slow noise, quantisation, time stamps that jitter, a small constant latency, lost packets, occlusions.
 """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.independent.data_set import DataSet
+from benchmarks.independent.data_set import ENGINES, DataSet
 from benchmarks.independent.scoring import (
     FIGURES,
     LIBRARY_KINDS,
@@ -60,17 +60,27 @@ def page(rows: Sequence[Row], earlier: Sequence[Row], every: Sequence[DataSet], 
         f" {older}. Processor time of a diagnosis: median {np.median(seconds):.0f} s, longest {seconds.max():.0f} s;"
         f" more than {CORE_SECONDS:.0f} s in {int((seconds > CORE_SECONDS).sum())}."
     )
+    bullet = any(r["world"] == "bullet" for r in rows)
+    worlds = "recordings of worlds that share no formula with the library: one on MuJoCo with another step, other"
+    worlds += " integrators, contacts, bristle friction and gears with rotor inertia, one on Drake"
+    worlds += ", one on Bullet" if bullet else ""
+    introduction = (
+        f"`python -m benchmarks.independent` diagnoses {worlds}. Encoders quantise, clocks jitter, readings are lost,"
+        " sensors have a latency below 0.5 ms; nominal masses, lengths and gains are wrong by up to 1 %, also where"
+        " nothing is hidden; noise is stated in half of the sets. Each diagnosis has 300 s on two cores and is told"
+        " that it has 285 s (`--seconds`); one that takes longer, or is unsettled then, counts as wrong."
+    )
+    split = (
+        "A quarter of the effects x rigs, the rigs `grasp` and `insertion`, and half of the Drake data"
+        f"{' and of the Bullet data' if bullet else ''} are locked by a rule on their names, fixed before any result:"
+        " `benchmarks/independent/split.json`."
+    )
     parts = [
         f"""# Diagnoses on independent worlds
 
-`python -m benchmarks.independent` diagnoses recordings of worlds that share no formula with the library: one on MuJoCo
-with another step, other integrators, contacts, bristle friction and gears with rotor inertia, one on Drake. Encoders
-quantise, clocks jitter, readings are lost, sensors have a latency below 0.5 ms; nominal masses, lengths and gains are
-wrong by up to 1 %, also where nothing is hidden; noise is stated in half of the sets. Each diagnosis has 300 s on two
-cores and is told that it has 285 s (`--seconds`); one that takes longer, or is unsettled then, counts as wrong.
+{textwrap.fill(introduction, 120)}
 
-A quarter of the effects x rigs, the rigs `grasp` and `insertion`, and half of the Drake data are locked by a rule on
-their names, fixed before any result: `benchmarks/independent/split.json`.
+{textwrap.fill(split, 120)}
 
 *Exactly right*: the effects that are there and nothing else, each named alone or in a group of at most two. No effect
 counts for another one. Square brackets have Wilson's 95 % intervals.
@@ -88,7 +98,9 @@ counts for another one. Square brackets have Wilson's 95 % intervals.
 
 
 def _figures(development: Sequence[Row], locked: Sequence[Row], before: dict[bool, list[Row]]) -> str:
-    """Return the table of the figures."""
+    """Return the table of the figures; without those of worlds that no result is of."""
+    seen = {r["world"] for r in [*development, *locked]}
+    missing = [engine for world, engine in ENGINES.items() if world not in seen]
     head = ["", "bar", "development", "earlier", "bar, locked", "locked", "earlier, locked"]
     lines = [
         [
@@ -101,6 +113,7 @@ def _figures(development: Sequence[Row], locked: Sequence[Row], before: dict[boo
             figure(measure(before[True])),
         ]
         for title, bar, bar_locked, measure in FIGURES
+        if not any(f", {engine}," in title for engine in missing)
     ]
     return table(head, lines)
 

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from benchmarks.independent.data_set import ENGINES, World
+
 Row = dict[str, Any]
 MAX_GROUP = 2
 """Most effects in a group that counts as naming one."""
@@ -157,20 +159,24 @@ def over(hit: Callable[[Row], bool], *kinds: str, **fields: Any) -> Measure:
     return measure
 
 
+BARS: tuple[tuple[World, bool, tuple[str, str]], ...] = (
+    ("mujoco", True, (">= 88 %", ">= 83 %")),
+    ("mujoco", False, (">= 83 %", ">= 78 %")),
+    ("drake", True, (">= 83 %", ">= 78 %")),
+    ("drake", False, (">= 78 %", ">= 73 %")),
+    ("bullet", True, ("", "")),
+    ("bullet", False, ("", "")),
+)
+"""World, whether noise is stated, bars of sets with one effect: of development sets and of locked ones."""
 FIGURES: tuple[tuple[str, str, str, Measure], ...] = (
     *(
         (
-            f"exactly right, {world}, noise {'stated' if stated else 'not stated'}",
+            f"exactly right, {ENGINES[world]}, noise {'stated' if stated else 'not stated'}",
             bars[0],
             bars[1],
-            over(exactly_right, "single", world=world.lower(), noise_stated=stated),
+            over(exactly_right, "single", world=world, noise_stated=stated),
         )
-        for world, stated, bars in (
-            ("MuJoCo", True, (">= 88 %", ">= 83 %")),
-            ("MuJoCo", False, (">= 83 %", ">= 78 %")),
-            ("Drake", True, (">= 83 %", ">= 78 %")),
-            ("Drake", False, (">= 78 %", ">= 73 %")),
-        )
+        for world, stated, bars in BARS
     ),
     ("right one in the first group", ">= 95 %", ">= 93 %", over(in_first_group, "single")),
     ("nothing hidden, false alarms", "<= 3 %", "<= 5 %", over(false_alarm, "null")),

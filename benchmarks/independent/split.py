@@ -4,8 +4,8 @@ python -m benchmarks.independent.split  # writes split.json by the rule
 
 The rule sees names only: a number between 0 and 1 from the SHA-256 of a text. Locked are, in the world on MuJoCo, the
 `LOCKED_RIGS` rigs whose names have the smallest numbers, and of the others every key (rig and effects) whose number is
-below `LOCKED_SHARE`; in the world on Drake every key whose number is below `LOCKED_DRAKE`. Whether a set is locked
-does not depend on which others there are.
+below `LOCKED_SHARE`; in the worlds on Drake and on Bullet every key whose number is below `LOCKED_HALF`. Whether a set
+is locked does not depend on which others there are.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from concent_warp.reality.rigs.registry import RIGS
 PATH = Path(__file__).with_name("split.json")
 LOCKED_RIGS = 2
 LOCKED_SHARE = 0.25
-LOCKED_DRAKE = 0.5
+LOCKED_HALF = 0.5
 
 
 def locked_rigs() -> list[str]:
@@ -32,8 +32,8 @@ def locked_rigs() -> list[str]:
 
 def locked_by_rule(case: DataSet) -> bool:
     """Return whether the rule locks a data set."""
-    if case.world == "drake":
-        return number(case.key) < LOCKED_DRAKE
+    if case.world != "mujoco":
+        return number(case.key) < LOCKED_HALF
     return case.rig in locked_rigs() or number(case.key) < LOCKED_SHARE
 
 

@@ -1,1 +1,1 @@
-"""The world on Drake: experiments, simulation, hidden effects, recordings. Only `simulation` imports Drake."""
+"""The world on Drake: experiments and their simulation. Only `simulation` imports Drake."""

@@ -14,45 +14,9 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.independent.drake.rig import DrakeRig, DrakeTrial, Drive, Sensor
-
-RATE = 125.0
-"""Rate of commands [Hz]."""
-
-
-def ramp(start: float, end: float, speed: float) -> np.ndarray:
-    """Return a straight line at a speed [unit/s], from start (excluded) to end."""
-    count = max(1, round(abs(end - start) / speed * RATE))
-    return start + (end - start) * np.arange(1, count + 1) / count
-
-
-def rest(value: float, duration: float) -> np.ndarray:
-    """Return a constant for a duration [s]."""
-    return np.full(round(duration * RATE), value)
-
-
-def cosine(start: float, end: float, duration: float) -> np.ndarray:
-    """Return half a cosine from start to end in a duration [s]."""
-    phase = np.arange(1, round(duration * RATE) + 1) / round(duration * RATE)
-    return start + (end - start) * (1 - np.cos(np.pi * phase)) / 2
-
-
-def tones(
-    rng: np.random.Generator, centre: float, amplitude: float, low: float, high: float, duration: float
-) -> np.ndarray:
-    """Return a sum of five tones between two frequencies [Hz] that fades in and out."""
-    t = np.arange(1, round(duration * RATE) + 1) / RATE
-    frequencies = np.geomspace(low, high, 5) * rng.uniform(0.9, 1.1, 5)
-    waves = np.sin(2 * np.pi * np.outer(t, frequencies) + rng.uniform(0, 2 * np.pi, 5)) / np.sqrt(frequencies)
-    fade = np.clip(np.minimum(t, duration - t) / 0.4, 0, 1)
-    return centre + amplitude * fade * waves.sum(axis=1) / np.abs(waves.sum(axis=1)).max()
-
-
-def timed(*parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and values of commands one after the other, shapes (T,)."""
-    value = np.concatenate(parts)
-    return np.arange(len(value)) / RATE, value
-
+from benchmarks.independent.foreign.plans import RATE, cosine, ramp, rest, timed, tones
+from benchmarks.independent.foreign.rig import Drive, ForeignRig, ForeignTrial, Sensor
+from benchmarks.independent.foreign.values import BALL, ball, block, nominal_contact, tracked
 
 SWING = """
 <mujoco model="swing">
@@ -77,7 +41,7 @@ SWING = """
 """
 
 
-def swing_plan(rng: np.random.Generator) -> DrakeTrial:
+def swing_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample ramps at several speeds, slow reversals, holds at height, and a sum of tones: about 10 s."""
     side = rng.choice([-1.0, 1.0])
     a, b, c = side * rng.uniform(1.0, 1.4), -side * rng.uniform(0.8, 1.2), side * rng.uniform(0.3, 0.7)
@@ -94,7 +58,7 @@ def swing_plan(rng: np.random.Generator) -> DrakeTrial:
         ramp(c - 0.12, c, rng.uniform(0.12, 0.2)),
         rest(c, 0.3),
     )
-    return DrakeTrial(len(action[0]) / RATE, {"servo": action}, before=0.5)
+    return ForeignTrial(len(action[0]) / RATE, {"servo": action}, before=0.5)
 
 
 REACH = """
@@ -127,7 +91,7 @@ REACH = """
 """
 
 
-def reach_plan(rng: np.random.Generator) -> DrakeTrial:
+def reach_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample point-to-point motions, slow sweeps and tones of both joints: about 8 s."""
     series = []
     for reach, kind in ((1.0, 0), (1.2, 1)):
@@ -138,7 +102,7 @@ def reach_plan(rng: np.random.Generator) -> DrakeTrial:
     most = max(map(len, series))
     padded = [np.concatenate([s, np.full(most - len(s) + 40, s[-1])]) for s in series]
     action = {name: timed(s) for name, s in zip(("shoulder_servo", "elbow_servo"), padded, strict=True)}
-    return DrakeTrial((most + 40) / RATE, action, before=1.0)
+    return ForeignTrial((most + 40) / RATE, action, before=1.0)
 
 
 GANTRY = """
@@ -175,7 +139,7 @@ GANTRY = """
 """
 
 
-def gantry_plan(rng: np.random.Generator) -> DrakeTrial:
+def gantry_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample a push along x off the centre, a retreat, and a second push with a sideways motion: about 6 s."""
     near, far, end = rng.uniform(0.09, 0.13), rng.uniform(0.02, 0.05), rng.uniform(0.15, 0.18)
     first, second = rng.uniform(-0.02, 0.02, 2)
@@ -190,7 +154,7 @@ def gantry_plan(rng: np.random.Generator) -> DrakeTrial:
     action = {"motor_x": timed(series), "motor_y": timed(np.concatenate([y, drift]))}
     turn = rng.uniform(-0.2, 0.2)
     pose = (*rng.uniform(-0.004, 0.004, 2), 0.025, np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
-    return DrakeTrial(len(series) / RATE, action, pose=pose, before=0.3)
+    return ForeignTrial(len(series) / RATE, action, pose=pose, before=0.3)
 
 
 LAUNCH = """
@@ -212,62 +176,47 @@ LAUNCH = """
 """
 
 
-def launch_plan(rng: np.random.Generator) -> DrakeTrial:
+def launch_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample a launch over the middle of the table with some spin."""
     heading, turn, speed = *rng.uniform(-np.pi, np.pi, 2), rng.uniform(0.6, 1.2)
     x, y = rng.uniform(-0.03, 0.03, 2) - 0.1 * np.array([np.cos(heading), np.sin(heading)])
     pose = (x, y, 0.02, np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
     velocity = (speed * np.cos(heading), speed * np.sin(heading), 0.0, 0.0, 0.0, rng.uniform(-2.0, 2.0))
-    return DrakeTrial(speed / 3.0 + 0.3, pose=pose, velocity=velocity)
+    return ForeignTrial(speed / 3.0 + 0.3, pose=pose, velocity=velocity)
 
 
-BALL = """
-<mujoco model="{model}">
-  <compiler angle="radian"/>
-  <option timestep="0.0005" integrator="implicitfast" cone="elliptic"/>
-  <default>
-    <geom friction="{{friction}} 0.005 0.0001" {contact}/>
-  </default>
-  <worldbody>
-    <geom name="table" type="plane" size="3 3 0.1"/>
-    <body name="ball" pos="0 0 {height}">
-      <freejoint/>
-      <inertial pos="0 0 0" mass="{{mass}}" diaginertia="{{inertia}} {{inertia}} {{inertia}}"/>
-      <geom name="ball" type="sphere" size="{{radius}}"/>
-    </body>
-  </worldbody>
-  <sensor>
-    <framepos name="ball_position" objtype="xbody" objname="ball"/>{extra}
-  </sensor>
-</mujoco>
-"""
 BOUNCE = BALL.format(
-    model="bounce", contact='solref="{time_constant} {damping_ratio}" solimp="0.98 0.98 0.001"', height=0.5, extra=""
+    model="bounce",
+    contact='solref="{time_constant} {damping_ratio}" solimp="0.98 0.98 0.001"',
+    height=0.5,
+    table="",
+    extra="",
 )
 ROLL = BALL.format(
     model="roll",
     contact="",
     height="{radius}",
+    table="",
     extra='\n    <framequat name="ball_orientation" objtype="xbody" objname="ball"/>',
 )
 
 
-def bounce_plan(rng: np.random.Generator) -> DrakeTrial:
+def bounce_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample a throw that meets the table twice."""
     heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 1.2)
     pose = (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.35, 0.5), 1.0, 0.0, 0.0, 0.0)
     velocity = (speed * np.cos(heading), speed * np.sin(heading), rng.uniform(0.3, 1.2), *rng.uniform(-3, 3, 3))
-    return DrakeTrial(0.85, pose=pose, velocity=velocity)
+    return ForeignTrial(0.85, pose=pose, velocity=velocity)
 
 
-def roll_plan(rng: np.random.Generator) -> DrakeTrial:
+def roll_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample a ball shoved over the middle of the table; it skids before it rolls."""
     heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 1.1)
     quaternion = Rotation.random(None, rng).as_quat(scalar_first=True)
     x, y = rng.uniform(-0.03, 0.03, 2) - 0.1 * np.array([np.cos(heading), np.sin(heading)])
     pose = (x, y, 0.03, *quaternion)
     velocity = (speed * np.cos(heading), speed * np.sin(heading), 0.0, 0.0, 0.0, rng.uniform(-2, 2))
-    return DrakeTrial(1.5, pose=pose, velocity=velocity)
+    return ForeignTrial(1.5, pose=pose, velocity=velocity)
 
 
 TOSS = """
@@ -289,35 +238,12 @@ TOSS = """
 """
 
 
-def toss_plan(rng: np.random.Generator) -> DrakeTrial:
+def toss_plan(rng: np.random.Generator) -> ForeignTrial:
     """Sample a throw with spin that ends before it lands."""
     quaternion = Rotation.random(None, rng).as_quat(scalar_first=True)
     pose = (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 0.8), *quaternion)
     velocity = (*rng.uniform(-1.5, 1.5, 2), rng.uniform(2.0, 3.0), *rng.uniform(-8, 8, 3))
-    return DrakeTrial(0.7, pose=pose, velocity=velocity)
-
-
-def _block(x: float, y: float, z: float, mass: float) -> dict[str, float]:
-    return {"half_x": x, "half_y": y, "half_z": z, "mass": mass}
-
-
-def _ball(radius: float, mass: float, share: float) -> dict[str, float]:
-    """Return radius, mass, and inertia as a share of that of all mass at the surface's distance."""
-    return {"radius": radius, "mass": mass, "inertia": share * mass * radius**2}
-
-
-def nominal_contact(stiffness: float, damping_ratio: float, mass: float) -> dict[str, float]:
-    """Return a contact's values and MuJoCo's time constant for a linear spring [N/m] and damper on a mass [kg]."""
-    frequency = np.sqrt(stiffness / mass)
-    return {
-        "stiffness": stiffness,
-        "damping_ratio": damping_ratio,
-        "time_constant": float(1 / (frequency * damping_ratio)),
-    }
-
-
-def _tracked(body: str) -> tuple[Sensor, ...]:
-    return (Sensor(f"{body}_position", "position", body), Sensor(f"{body}_orientation", "orientation", body))
+    return ForeignTrial(0.7, pose=pose, velocity=velocity)
 
 
 def _hand(v: Mapping[str, float]) -> tuple[float, float, float]:
@@ -325,7 +251,7 @@ def _hand(v: Mapping[str, float]) -> tuple[float, float, float]:
 
 
 _RIGS = (
-    DrakeRig(
+    ForeignRig(
         "swing",
         SWING,
         {
@@ -345,8 +271,9 @@ _RIGS = (
         friction={"axle": "friction"},
         damping={"axle": "damping"},
         body="swing",
+        engine="Drake",
     ),
-    DrakeRig(
+    ForeignRig(
         "reach",
         REACH,
         {
@@ -370,19 +297,20 @@ _RIGS = (
         links=("upper", "fore"),
         damping={"shoulder": "damping_1", "elbow": "damping_2"},
         body="fore",
+        engine="Drake",
     ),
-    DrakeRig(
+    ForeignRig(
         "gantry",
         GANTRY,
         {
-            **_block(0.05, 0.04, 0.025, 0.35),
+            **block(0.05, 0.04, 0.025, 0.35),
             **{"bridge": 1.2, "carriage": 0.7, "damping": 3.0, "friction_x": 0.4, "friction_y": 0.3},
             **{"kp_x": 1800.0, "kv_x": 70.0, "kp_y": 1400.0, "kv_y": 45.0, "friction": 0.35},
             **{"finger_radius": 0.01, "finger_length": 0.02, "pad": 0.2, "no_armature": 0.0},
         },
         ("mass", "bridge", "carriage", "kp_x", "kv_x", "kp_y", "kv_y"),
         ("half_x", "half_y", "half_z", "finger_radius"),
-        (Sensor("encoder_x", "travel", "slide_x"), Sensor("encoder_y", "travel", "slide_y"), *_tracked("block")),
+        (Sensor("encoder_x", "travel", "slide_x"), Sensor("encoder_y", "travel", "slide_y"), *tracked("block")),
         gantry_plan,
         5e-4,
         drives=(
@@ -395,24 +323,26 @@ _RIGS = (
         body="block",
         shape="box",
         finger="carriage",
+        engine="Drake",
     ),
-    DrakeRig(
+    ForeignRig(
         "launch",
         LAUNCH,
-        {**_block(0.045, 0.035, 0.02, 0.25), "friction": 0.3},
+        {**block(0.045, 0.035, 0.02, 0.25), "friction": 0.3},
         ("mass",),
         ("half_x", "half_y", "half_z"),
-        _tracked("block"),
+        tracked("block"),
         launch_plan,
         5e-4,
         body="block",
         shape="box",
         throws=5,
+        engine="Drake",
     ),
-    DrakeRig(
+    ForeignRig(
         "bounce",
         BOUNCE,
-        {**_ball(0.035, 0.06, 0.5), **nominal_contact(6e3, 0.1, 0.06), "friction": 0.04},
+        {**ball(0.035, 0.06, 0.5), **nominal_contact(6e3, 0.1, 0.06), "friction": 0.04},
         ("mass", "inertia"),
         ("radius",),
         (Sensor("ball_position", "position", "ball"),),
@@ -422,34 +352,37 @@ _RIGS = (
         shape="ball",
         bounces=True,
         throws=5,
+        engine="Drake",
     ),
-    DrakeRig(
+    ForeignRig(
         "roll",
         ROLL,
-        {**_ball(0.03, 0.12, 0.4), "friction": 0.15},
+        {**ball(0.03, 0.12, 0.4), "friction": 0.15},
         ("mass", "inertia"),
         ("radius",),
-        _tracked("ball"),
+        tracked("ball"),
         roll_plan,
         5e-4,
         body="ball",
         shape="ball",
         throws=4,
         start_recorded=True,
+        engine="Drake",
     ),
-    DrakeRig(
+    ForeignRig(
         "toss",
         TOSS,
-        {**_block(0.06, 0.035, 0.02, 0.3), "inertia_x": 1.7e-4, "inertia_y": 4.2e-4, "inertia_z": 5.0e-4},
+        {**block(0.06, 0.035, 0.02, 0.3), "inertia_x": 1.7e-4, "inertia_y": 4.2e-4, "inertia_z": 5.0e-4},
         ("mass", "inertia_x+inertia_y+inertia_z"),
         (),
-        _tracked("brick"),
+        tracked("brick"),
         toss_plan,
         1e-3,
         continuous=True,
         body="brick",
         throws=6,
         start_recorded=True,
+        engine="Drake",
     ),
 )
 DRAKE_RIGS = {rig.name: rig for rig in _RIGS}

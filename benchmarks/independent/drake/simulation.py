@@ -24,16 +24,22 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.signal import lfilter
 
-from benchmarks.independent.drake.rig import (
+from benchmarks.independent.foreign.drives import (
+    CONTROL_PERIOD,
+    GEAR_DAMPING,
+    RECORD_PERIOD,
+    Bristle,
+    setpoints,
+)
+from benchmarks.independent.foreign.rig import (
     ENCODERS,
     BodyState,
-    DrakeRig,
-    DrakeTrial,
     Drive,
     DriveState,
-    Friction,
+    ForeignMotion,
+    ForeignRig,
+    ForeignTrial,
     Physics,
 )
 
@@ -42,16 +48,10 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("the world on Drake needs the extra: pip install 'concent-warp[benchmarks]'") from error
 
-CONTROL_PERIOD = 1e-3
-"""Period of the drives' controllers [s]."""
-RECORD_PERIOD = 5e-4
-"""Spacing of the recorded true motion [s]."""
 GEAR_RATIO = 50.0
 """Rotor turns per turn of a joint [-]."""
 PLAY_STIFFNESS = 200.0
 """Stiffness of teeth at either end of the play [N m/rad]."""
-GEAR_DAMPING = 0.05
-"""Damping ratio of gears, of the rotor on the spring [-]."""
 MODULUS = 1e7
 """Hydroelastic modulus of blocks [Pa]."""
 DISSIPATION = 5.0
@@ -66,20 +66,6 @@ SLOSH_FREQUENCY = 2.0
 """Frequency of mass that swings in a body [Hz]."""
 SLOSH_PLACE = 0.02
 """Where that mass rests, along the body's x [m]."""
-
-
-@dataclass(frozen=True)
-class DrakeMotion:
-    """The true motion on a grid of times."""
-
-    time: np.ndarray
-    """Times [s], shape (K,), from before 0 on."""
-    joints: dict[str, np.ndarray]
-    """Positions of joints [rad or m], shapes (K,)."""
-    motors: dict[str, np.ndarray]
-    """Positions on the motor's side of gears, by joint, shapes (K,); the joint's where there is no gear."""
-    poses: dict[str, np.ndarray]
-    """Poses of bodies that sensors see, x y z and quaternion wxyz, shapes (K, 7)."""
 
 
 @dataclass
@@ -111,7 +97,7 @@ class _World:
     motor_joints: dict[str, Any] = field(default_factory=dict)
 
 
-def simulate(rig: DrakeRig, physics: Physics, trial: DrakeTrial) -> DrakeMotion:
+def simulate(rig: ForeignRig, physics: Physics, trial: ForeignTrial) -> ForeignMotion:
     """Return the true motion of a trial.
 
     Raises:
@@ -180,35 +166,10 @@ def simulate(rig: DrakeRig, physics: Physics, trial: DrakeTrial) -> DrakeMotion:
     joints = {d.joint: motion[:, a.q] for d, a in zip(rig.drives, axes, strict=True)}
     motors = {d.joint: motion[:, a.motor_q] for d, a in zip(rig.drives, axes, strict=True)}
     stacked = np.array(poses)
-    return DrakeMotion(np.array(times), joints, motors, {name: stacked[:, i] for i, name in enumerate(seen)})
+    return ForeignMotion(np.array(times), joints, motors, {name: stacked[:, i] for i, name in enumerate(seen)})
 
 
-class Bristle:
-    """LuGre friction of one joint, its bristle integrated exactly over steps of constant velocity."""
-
-    def __init__(self, friction: Friction, dt: float):
-        self.friction, self.dt = friction, dt
-        self.deflection = 0.0
-
-    def force(self, time: float, speed: float) -> float:
-        """Return the friction [N m or N] against a speed, over one step."""
-        f = self.friction
-        level = (f.coulomb + f.extra * np.exp(-((speed / f.speed) ** 2))) * f.scale(time)
-        most = max(f.coulomb + f.extra, 1e-12)
-        stiffness = most / f.bristle
-        slack = level / stiffness  # deflection in steady sliding
-        pace = abs(speed)
-        before = self.deflection
-        if slack <= 0:
-            self.deflection = 0.0
-        elif pace > 0:
-            keep = np.exp(-pace * self.dt / slack)
-            self.deflection = np.sign(speed) * slack * (1 - keep) + before * keep
-        damping = 2e-3 * stiffness  # bristles come to rest within a few ms
-        return stiffness * self.deflection + damping * (self.deflection - before)
-
-
-def build(rig: DrakeRig, physics: Physics) -> _World:
+def build(rig: ForeignRig, physics: Physics) -> _World:
     """Return the world of a rig, its masses set, at the initial pose of the MJCF."""
     logging.getLogger("drake").setLevel(logging.ERROR)
     builder = drake.DiagramBuilder()
@@ -280,7 +241,7 @@ def _motor(plant: Any, joint: Any, armature: float) -> Any:
     )
 
 
-def _add_slosh(rig: DrakeRig, physics: Physics, plant: Any) -> None:
+def _add_slosh(rig: ForeignRig, physics: Physics, plant: Any) -> None:
     """Add a mass that swings on springs along the body's x and y."""
     body = plant.GetBodyByName(rig.body)
     part = physics.slosh * body.default_mass()
@@ -298,7 +259,7 @@ def _add_slosh(rig: DrakeRig, physics: Physics, plant: Any) -> None:
         frame = inner.body_frame()
 
 
-def _add_contacts(rig: DrakeRig, physics: Physics, plant: Any) -> None:
+def _add_contacts(rig: ForeignRig, physics: Physics, plant: Any) -> None:
     """Add table, body and finger as they touch each other."""
     v, size = physics.values, physics.size
     table = _material(v["friction"] / (2 - v["friction"]))  # with a body of coefficient 1, Drake's mean is `friction`
@@ -345,7 +306,7 @@ def _material(friction: float, stiffness: float = 1e12, relaxation: float = 0.0)
     return properties
 
 
-def _weigh(rig: DrakeRig, physics: Physics, plant: Any, context: Any) -> None:
+def _weigh(rig: ForeignRig, physics: Physics, plant: Any, context: Any) -> None:
     """Set mass, centre of mass and inertia of the body under test."""
     body = plant.GetBodyByName(rig.body)
     nominal = body.default_spatial_inertia()
@@ -359,7 +320,7 @@ def _weigh(rig: DrakeRig, physics: Physics, plant: Any, context: Any) -> None:
     body.SetSpatialInertiaInBodyFrame(context, shifted)
 
 
-def _place(rig: DrakeRig, physics: Physics, trial: DrakeTrial, plant: Any, context: Any) -> None:
+def _place(rig: ForeignRig, physics: Physics, trial: ForeignTrial, plant: Any, context: Any) -> None:
     """Set the state in which the simulation begins: drives at their first command, the free body as the trial says."""
     q, v = plant.GetPositions(context), plant.GetVelocities(context)
     for drive in rig.drives:
@@ -380,7 +341,7 @@ def _place(rig: DrakeRig, physics: Physics, trial: DrakeTrial, plant: Any, conte
     plant.SetVelocities(context, v)
 
 
-def _axis(rig: DrakeRig, physics: Physics, trial: DrakeTrial, drive: Drive, world: _World, steps: int) -> _Axis:
+def _axis(rig: ForeignRig, physics: Physics, trial: ForeignTrial, drive: Drive, world: _World, steps: int) -> _Axis:
     """Return a drive at the beginning of a trial."""
     state, values = physics.drives[drive.actuator], physics.values
     q, v = _dof(world.plant, drive.joint)
@@ -404,16 +365,6 @@ def _axis(rig: DrakeRig, physics: Physics, trial: DrakeTrial, drive: Drive, worl
         stiffness,
         damping,
     )
-
-
-def setpoints(time: np.ndarray, value: np.ndarray, ticks: np.ndarray, state: DriveState) -> np.ndarray:
-    """Return what a drive controls towards at its ticks [s], shape (N,), given commands (T,)."""
-    row = np.searchsorted(time, ticks - state.delay + 1e-9, side="right") - 1
-    held = value[np.maximum(row, 0)]
-    if not state.lag:
-        return held
-    share = 1 - np.exp(-CONTROL_PERIOD / state.lag)
-    return np.asarray(lfilter([share], [1, share - 1], held - held[0])) + held[0]
 
 
 def _dof(plant: Any, joint: str) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Recordings of the world on Drake: readings of its motion, and what a user knows of the beginning."""
+"""Recordings of the worlds on other engines: readings of its motion, and what a user knows of the beginning."""
 
 from __future__ import annotations
 
@@ -7,8 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.independent.drake.rig import ENCODERS, DrakeRig, Physics, Sensor
-from benchmarks.independent.drake.simulation import DrakeMotion, simulate
+from benchmarks.independent.foreign.rig import (
+    ENCODERS,
+    DriveState,
+    ForeignMotion,
+    ForeignRig,
+    Physics,
+    Sensor,
+    Simulate,
+)
 from benchmarks.independent.instruments import Instrument, Instruments
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 
@@ -26,7 +33,7 @@ class Made:
     """For each demonstration qpos (nq,) and qvel (nv,) of the nominal scene, or None where it has no free body."""
 
 
-def record_drake(rig: DrakeRig, physics: Physics, seed: int, demonstrations: int, *, noise_stated: bool = True) -> Made:
+def record(rig: ForeignRig, physics: Physics, simulate: Simulate, seed: int, demonstrations: int) -> Made:
     """Return a recording, the same each time; motions, clocks and noise do not depend on what is hidden."""
     instruments = Instruments.of(seed, video=rig.throws > 1)
     taken, starts = [], []
@@ -35,21 +42,19 @@ def record_drake(rig: DrakeRig, physics: Physics, seed: int, demonstrations: int
         motion = simulate(rig, physics, trial)
         rng = np.random.default_rng([seed, k, 1, *rig.name.encode()])
         measured = {s.name: _reading(rig, physics, s, motion, instruments, rng) for s in rig.sensors}
-        if not noise_stated:
-            measured = {name: replace(channel, noise_std=None) for name, channel in measured.items()}
         start = _start(rig, motion) if rig.free else None
         known = (None, None) if start is None or not rig.start_recorded else _estimate(start, rng)
         action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
         taken.append(Demonstration(f"demo_{k}", rig.name, None, *known, action=action, measured=measured))
         starts.append(start)
-    return Made(Recording(rig.scene.xml, tuple(taken), source=f"world on Drake, {rig.name}"), tuple(starts))
+    return Made(Recording(rig.scene.xml, tuple(taken), source=f"world on {rig.engine}, {rig.name}"), tuple(starts))
 
 
 def _reading(
-    rig: DrakeRig,
+    rig: ForeignRig,
     physics: Physics,
     sensor: Sensor,
-    motion: DrakeMotion,
+    motion: ForeignMotion,
     instruments: Instruments,
     rng: np.random.Generator,
 ) -> Channel:
@@ -67,10 +72,10 @@ def _reading(
     return channel
 
 
-def truth_of(rig: DrakeRig, physics: Physics, sensor: Sensor, motion: DrakeMotion) -> np.ndarray:
+def truth_of(rig: ForeignRig, physics: Physics, sensor: Sensor, motion: ForeignMotion) -> np.ndarray:
     """Return what there is to see of a sensor's target, shape (K, dim)."""
     if sensor.kind in ENCODERS:
-        state = next(physics.drives[d.actuator] for d in rig.drives if d.joint == sensor.target)
+        state = next((physics.drives[d.actuator] for d in rig.drives if d.joint == sensor.target), DriveState())
         position = motion.motors[sensor.target] if state.compliance else motion.joints[sensor.target]
         return (position - state.offset)[:, None]
     pose = motion.poses[sensor.target]
@@ -85,7 +90,7 @@ def _instrument(sensor: Sensor, instruments: Instruments) -> Instrument:
     return getattr(instruments, "position" if sensor.kind == "marker" else sensor.kind)
 
 
-def _start(rig: DrakeRig, motion: DrakeMotion) -> tuple[np.ndarray, np.ndarray]:
+def _start(rig: ForeignRig, motion: ForeignMotion) -> tuple[np.ndarray, np.ndarray]:
     """Return the nominal scene's state at time 0, qpos (nq,) and qvel (nv,); driven joints stand before the body."""
     pose = motion.poses[rig.body]
     k = int(np.searchsorted(motion.time, -1e-9))

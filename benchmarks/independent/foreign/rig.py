@@ -1,7 +1,7 @@
-"""What an experiment of the world on Drake consists of: nominal scene, motions, sensors, true physics.
+"""What an experiment of a world on another engine consists of: nominal scene, motions, sensors, true physics.
 
 The nominal scene is MJCF text with named values. The world's values are drawn about them: masses and gains within
-`TOLERANCE`, lengths within `TOLERANCE` and `MACHINING`. Nothing here imports Drake.
+`TOLERANCE`, lengths within `TOLERANCE` and `MACHINING`. Nothing here imports an engine.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class DrakeTrial:
+class ForeignTrial:
     """One motion."""
 
     duration: float
@@ -68,7 +68,7 @@ class DrakeTrial:
 
 
 @dataclass(frozen=True)
-class DrakeRig:
+class ForeignRig:
     """An experiment."""
 
     name: str
@@ -81,7 +81,7 @@ class DrakeRig:
     lengths: tuple[str, ...]
     """Values that are lengths."""
     sensors: tuple[Sensor, ...]
-    plan: Callable[[np.random.Generator], DrakeTrial]
+    plan: Callable[[np.random.Generator], ForeignTrial]
     """Samples a motion."""
     step: float
     """Time step of the discrete world [s]; of a continuous one, the time over which external forces are held."""
@@ -106,11 +106,15 @@ class DrakeRig:
     """Motions of a demonstration."""
     start_recorded: bool = False
     """Whether the recording has an estimate of the initial state."""
+    engine: Literal["Drake", "Bullet"] = field(kw_only=True)
+    """What simulates the world."""
 
     @cached_property
     def scene(self) -> Scene:
         """The user's nominal scene."""
-        return Scene.from_spec(mujoco.MjSpec.from_string(self.text.format(**self.values)), source=f"{self.name}, Drake")
+        return Scene.from_spec(
+            mujoco.MjSpec.from_string(self.text.format(**self.values)), source=f"{self.name}, {self.engine}"
+        )
 
     @property
     def free(self) -> bool:
@@ -120,7 +124,8 @@ class DrakeRig:
     @property
     def hinges(self) -> bool:
         """Whether driven joints are hinges."""
-        return any(s.kind in ("angle", "fine_angle") for s in self.sensors)
+        m = self.scene.model
+        return any(m.jnt_type[m.joint(d.joint).id] == mujoco.mjtJoint.mjJNT_HINGE for d in self.drives)
 
     def drawn(self, seed: int) -> dict[str, float]:
         """Return the world's values, drawn about the nominal ones by a seed."""
@@ -216,7 +221,7 @@ class Physics:
     size: float = 1.0
     """Factor on its size where it touches the table [-]; mass and inertia stay."""
     slosh: float = 0.0
-    """Share of the body's mass that swings in it on springs [-]."""
+    """Share of the body's mass that swings in it on springs [-]; on Drake only."""
     body_forces: list[BodyForce] = field(default_factory=list)
     joint_forces: dict[str, list[JointForce]] = field(default_factory=dict)
     measures: list[Measure] = field(default_factory=list)
@@ -224,7 +229,7 @@ class Physics:
     """Age of what trackers, or encoders where there is no tracker, see beyond the instruments' own [s]."""
 
 
-def true_physics(rig: DrakeRig, seed: int) -> Physics:
+def true_physics(rig: ForeignRig, seed: int) -> Physics:
     """Return the world of a rig in which nothing is hidden."""
     values = rig.drawn(seed)
     return Physics(
@@ -233,3 +238,21 @@ def true_physics(rig: DrakeRig, seed: int) -> Physics:
         {joint: Friction(values[name]) for joint, name in rig.friction.items()},
         {joint: values[name] for joint, name in rig.damping.items()},
     )
+
+
+@dataclass(frozen=True)
+class ForeignMotion:
+    """The true motion on a grid of times."""
+
+    time: np.ndarray
+    """Times [s], shape (K,), from before 0 on."""
+    joints: dict[str, np.ndarray]
+    """Positions of joints [rad or m], shapes (K,)."""
+    motors: dict[str, np.ndarray]
+    """Positions on the motor's side of gears, by joint, shapes (K,); the joint's where there is no gear."""
+    poses: dict[str, np.ndarray]
+    """Poses of bodies that sensors see, x y z and quaternion wxyz, shapes (K, 7)."""
+
+
+Simulate = Callable[[ForeignRig, Physics, ForeignTrial], ForeignMotion]
+"""What an engine does: return the true motion of a trial."""

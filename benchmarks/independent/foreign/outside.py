@@ -1,4 +1,4 @@
-"""Hidden effects of the world on Drake that the library lacks. Nothing here imports Drake."""
+"""Hidden effects of the worlds on other engines that the library lacks. Nothing here imports an engine."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.independent.data_set import Truth
-from benchmarks.independent.drake.hidden import Hidden
-from benchmarks.independent.drake.rig import BodyState, DrakeRig, Friction, JointForce, Physics
+from benchmarks.independent.foreign.hidden import Hidden
+from benchmarks.independent.foreign.rig import BodyState, ForeignRig, Friction, JointForce, Physics
 
 POLES = 11
 """Periods of cogging in a turn of a joint."""
@@ -20,7 +20,7 @@ REACH = 0.06
 """How far magnet and sticky spot reach [m]."""
 
 
-def cogging(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def cogging(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add a torque with two harmonics of the motor's poles [N m or N]."""
     pitch = POLES if rig.hinges else 2 * np.pi / POLE_PITCH
 
@@ -35,7 +35,7 @@ def cogging(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("cogging", rig)
 
 
-def warming(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def warming(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add Coulomb friction [N m or N] that falls to a third within 2.5 s, as grease gets warm."""
     for d in rig.drives:
         friction = physics.friction.setdefault(d.joint, Friction(0.0))
@@ -49,7 +49,7 @@ def warming(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("warming", rig)
 
 
-def cable(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def cable(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add the torque of a cable that stiffens as it is bent [N m/rad^3 or N/m^3], about a position off zero."""
     middle = 0.4 if rig.hinges else 0.03
 
@@ -64,7 +64,7 @@ def cable(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("cable", rig)
 
 
-def faltering(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def faltering(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add a torque [N m or N] in single pulses of 0.25 s at four times, as of a failing amplifier."""
 
     def of(weight: float) -> JointForce:
@@ -79,7 +79,7 @@ def faltering(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("faltering", rig)
 
 
-def magnet(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def magnet(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add the pull of a magnet under the table [N], horizontal, largest at `REACH`."""
 
     def force(time: float, state: BodyState) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +92,7 @@ def magnet(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("magnet", rig)
 
 
-def sticky_spot(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def sticky_spot(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add viscous drag [N s/m] within `REACH` of a place on the table."""
 
     def force(time: float, state: BodyState) -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +104,7 @@ def sticky_spot(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("sticky_spot", rig)
 
 
-def gust(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def gust(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add a sideways force [N] that comes and goes at 2 Hz."""
 
     def force(time: float, state: BodyState) -> tuple[np.ndarray, np.ndarray]:
@@ -115,19 +115,19 @@ def gust(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return _outside("gust", rig)
 
 
-def slosh(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def slosh(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Let a share of the body's mass [-] swing in it on springs, about a place off its centre."""
     physics.slosh = magnitude
     return _outside("slosh", rig)
 
 
-def _on_joints(rig: DrakeRig, physics: Physics, of: Callable[[float], JointForce]) -> None:
+def _on_joints(rig: ForeignRig, physics: Physics, of: Callable[[float], JointForce]) -> None:
     """Add a force on each driven joint, given the drive's weight."""
     for d in rig.drives:
         physics.joint_forces.setdefault(d.joint, []).append(of(d.weight))
 
 
-def _outside(name: str, rig: DrakeRig) -> Truth:
+def _outside(name: str, rig: ForeignRig) -> Truth:
     target = (rig.body,) if rig.free and not rig.drives else tuple(d.joint for d in rig.drives)
     return Truth(name, {}, target, known=False)
 

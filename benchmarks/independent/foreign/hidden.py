@@ -1,6 +1,6 @@
-"""Hidden effects of the world on Drake: each changes the true physics of a rig and says what is true then.
+"""Hidden effects of the worlds on other engines: each changes the true physics of a rig and says what is true then.
 
-True values are those of the library's parameters, as the nominal model defines them. Nothing here imports Drake.
+True values are those of the library's parameters, as the nominal model defines them. Nothing here imports an engine.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.independent.data_set import Truth
-from benchmarks.independent.drake.rig import ENCODERS, BodyForce, BodyState, DrakeRig, Friction, Measure, Physics
+from benchmarks.independent.foreign.rig import ENCODERS, BodyForce, BodyState, ForeignRig, Friction, Measure, Physics
 
-Hidden = Callable[[DrakeRig, Physics, float], Truth]
+Hidden = Callable[[ForeignRig, Physics, float], Truth]
 DRAG_COEFFICIENT = 0.47
 """Drag coefficient of a sphere at Reynolds numbers from 1e3 to 1e5 [-]."""
 AIR_DENSITY = 1.2
 """Density of air at 20 degrees [kg/m^3]."""
 
 
-def joint_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def joint_friction(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add Coulomb friction [N m or N]."""
     true = {}
     for d in rig.drives:
@@ -29,7 +29,7 @@ def joint_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("joint_friction", true, _joints(rig))
 
 
-def stribeck_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def stribeck_friction(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add friction at rest that fades with speed [N m or N]."""
     true: dict[str, float] = {}
     for d in rig.drives:
@@ -40,7 +40,7 @@ def stribeck_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Trut
     return Truth("stribeck_friction", true, _joints(rig))
 
 
-def joint_damping(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def joint_damping(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add viscous damping [N m s/rad or N s/m]."""
     true = {}
     for d in rig.drives:
@@ -49,7 +49,7 @@ def joint_damping(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("joint_damping", true, _joints(rig))
 
 
-def armature(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def armature(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add reflected inertia of rotors [kg m^2 or kg]."""
     true = {}
     for d in rig.drives:
@@ -59,7 +59,7 @@ def armature(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("armature", true, _joints(rig))
 
 
-def actuator_gain(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def actuator_gain(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Multiply the drives' torque by a factor [-]."""
     true = {}
     for d in rig.drives:
@@ -68,35 +68,35 @@ def actuator_gain(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("actuator_gain", true, _actuators(rig))
 
 
-def actuator_saturation(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def actuator_saturation(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Limit the drives' torque [N m or N]."""
     for d in rig.drives:
         physics.drives[d.actuator].limit = magnitude
     return Truth("actuator_saturation", {"limit": magnitude}, _actuators(rig))
 
 
-def actuator_delay(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def actuator_delay(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Let commands act late [s]."""
     for d in rig.drives:
         physics.drives[d.actuator].delay = magnitude
     return Truth("actuator_delay", {"delay": magnitude}, _actuators(rig))
 
 
-def actuator_lag(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def actuator_lag(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Filter commands with a time constant [s]."""
     for d in rig.drives:
         physics.drives[d.actuator].lag = magnitude
     return Truth("actuator_lag", {"time_constant": magnitude}, _actuators(rig))
 
 
-def backlash(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def backlash(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Put free play [rad] between rotors and links."""
     for d in rig.drives:
         physics.drives[d.actuator].play = magnitude
     return Truth("backlash", {"play": magnitude}, _actuators(rig))
 
 
-def joint_compliance(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def joint_compliance(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Put springs of a compliance [rad/(N m)] between rotors and links."""
     true = {}
     for d in rig.drives:
@@ -106,7 +106,7 @@ def joint_compliance(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth
     return Truth("joint_compliance", true, _actuators(rig))
 
 
-def joint_offset(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def joint_offset(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Shift the zero of drives and encoders [rad or m]."""
     true = {}
     for d in rig.drives:
@@ -115,20 +115,20 @@ def joint_offset(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("joint_offset", true, _joints(rig))
 
 
-def gravity_compensation(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def gravity_compensation(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Let drives compensate a share of the links' weight [-], as the arm's controller knows it."""
     physics.compensation = magnitude
     return Truth("gravity_compensation", {"share": magnitude}, rig.links)
 
 
-def mass(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def mass(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Multiply mass and inertia of the body under test by a factor [-]."""
     physics.mass = magnitude
     name = "mass" if "mass" in physics.values else "mass_2"
     return Truth("mass", {"mass": magnitude * physics.values[name] / rig.values[name]}, (rig.body,))
 
 
-def inertia(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def inertia(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Multiply the inertia of the body under test by a factor [-]."""
     physics.inertia = magnitude
     factor = 1.0
@@ -137,26 +137,26 @@ def inertia(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("inertia", {"inertia": magnitude * factor}, (rig.body,))
 
 
-def center_of_mass(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def center_of_mass(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Shift the centre of mass of the body under test [m]."""
     physics.center = magnitude * np.array([0.8, -0.5, 0.33])
     return Truth("center_of_mass", dict(zip("xyz", map(float, physics.center), strict=True)), (rig.body,))
 
 
-def size(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def size(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Multiply the body's size by a factor [-]; mass and inertia stay."""
     physics.size = magnitude
     name = "radius" if rig.shape == "ball" else "half_z"
     return Truth("size", {"size": magnitude * physics.values[name] / rig.values[name]}, (rig.body,))
 
 
-def sliding_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def sliding_friction(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Set the coefficient of sliding friction on the table [-]."""
     physics.values["friction"] = magnitude
     return Truth("sliding_friction", {"coefficient": magnitude}, (rig.body,))
 
 
-def rolling_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def rolling_friction(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Brake rolling by a torque of a coefficient [m] times the weight."""
 
     def force(time: float, state: BodyState) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +171,7 @@ def rolling_friction(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth
     return Truth("rolling_friction", {"coefficient": magnitude}, (rig.body,))
 
 
-def contact_compliance(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def contact_compliance(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Set the damping ratio of the ball's contact [-]; its stiffness stays."""
     physics.values["damping_ratio"] = magnitude
     frequency = np.sqrt(rig.values["stiffness"] / rig.values["mass"])
@@ -179,7 +179,7 @@ def contact_compliance(rig: DrakeRig, physics: Physics, magnitude: float) -> Tru
     return Truth("contact_compliance", true, (rig.body,))
 
 
-def gravity_tilt(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def gravity_tilt(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Tilt the world: gravity turns about x by an angle [rad], and by -0.7 of it about y."""
     del rig
     x, y = magnitude, -0.7 * magnitude
@@ -205,13 +205,13 @@ def air(physics: Physics, density: float, wind: np.ndarray) -> BodyForce:
     return force
 
 
-def air_drag(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def air_drag(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add drag of still air, of a density times drag factor [kg/m^3]; the factor is 1 where the coefficient is 1."""
     physics.body_forces.append(air(physics, magnitude / DRAG_COEFFICIENT, np.zeros(3)))
     return Truth("air_drag", {"density": magnitude}, (rig.body,))
 
 
-def wind(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def wind(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add wind [m/s] along x, and a third of it against y.
 
     There are no true values: the library's wind has a drag factor of 1.
@@ -221,7 +221,7 @@ def wind(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("wind", {}, (rig.body,))
 
 
-def time_base(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def time_base(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Let clocks of trackers, or of encoders where there is no tracker, run fast by a share [-]."""
     names = _clocked(rig)
 
@@ -232,20 +232,20 @@ def time_base(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("time_base", {"scale": magnitude}, names)
 
 
-def latency(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def latency(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Let trackers, or encoders where there is no tracker, see what was some time ago [s]."""
     physics.sensor_delay = magnitude
     return Truth("latency", {"delay": magnitude}, _clocked(rig))
 
 
-def length_scale(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def length_scale(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Scale tracked positions by a share [-]."""
     names = tuple(s.name for s in rig.sensors if s.kind in ("marker", "position"))
     physics.measures.append(_changed(names, lambda _, value: value * (1 + magnitude)))
     return Truth("length_scale", {"scale": magnitude}, names)
 
 
-def frame_offset(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def frame_offset(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Shift tracked positions [m]."""
     shift = magnitude * np.array([1.0, -0.6, 0.4])
     names = tuple(s.name for s in rig.sensors if s.kind in ("marker", "position"))
@@ -255,14 +255,14 @@ def frame_offset(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
     return Truth("frame_offset", true, poses)
 
 
-def sensor_gain(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def sensor_gain(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Scale the readings of encoders by a share [-]; the drives' own are right."""
     names = _encoders(rig)
     physics.measures.append(_changed(names, lambda _, value: value * (1 + magnitude)))
     return Truth("sensor_gain", {f"scale[{n}]": magnitude for n in names}, names)
 
 
-def sensor_bias(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
+def sensor_bias(rig: ForeignRig, physics: Physics, magnitude: float) -> Truth:
     """Add a constant to the readings of encoders [rad or m]; the drives' own are right."""
     names = _encoders(rig)
     physics.measures.append(_changed(names, lambda _, value: value + magnitude))
@@ -278,20 +278,20 @@ def _changed(names: tuple[str, ...], change: Callable[[np.ndarray, np.ndarray], 
     return measure
 
 
-def _clocked(rig: DrakeRig) -> tuple[str, ...]:
+def _clocked(rig: ForeignRig) -> tuple[str, ...]:
     tracked = tuple(s.name for s in rig.sensors if s.kind not in ENCODERS)
     return tracked or _encoders(rig)
 
 
-def _encoders(rig: DrakeRig) -> tuple[str, ...]:
+def _encoders(rig: ForeignRig) -> tuple[str, ...]:
     return tuple(s.name for s in rig.sensors if s.kind in ENCODERS)
 
 
-def _joints(rig: DrakeRig) -> tuple[str, ...]:
+def _joints(rig: ForeignRig) -> tuple[str, ...]:
     return tuple(d.joint for d in rig.drives)
 
 
-def _actuators(rig: DrakeRig) -> tuple[str, ...]:
+def _actuators(rig: ForeignRig) -> tuple[str, ...]:
     return tuple(d.actuator for d in rig.drives)
 
 

@@ -1,0 +1,1 @@
+"""The world on Bullet: experiments and their simulation. Only `simulation` imports Bullet."""
