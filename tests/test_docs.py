@@ -41,6 +41,8 @@ shutil.copy({str(ROOT / "examples" / "hidden_effect" / "demo.h5")!r}, "demo.h5")
 """,
 }
 """What a page takes as given."""
+LONG = ("distil.md", "explain.md", "flow_policy.md")
+"""Pages whose Python takes most of a minute."""
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
@@ -64,7 +66,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow if page.name in LONG else (), id=page.name)
+        for page in PAGES
+        if blocks(page, "python")
+    ],
+)
 def test_python_of_a_page_runs_from_top_to_bottom(page, recorded, tmp_path):
     (tmp_path / "demo.h5").symlink_to(recorded)
     (tmp_path / "runs" / "demo").mkdir(parents=True)

@@ -13,6 +13,9 @@ from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.recording import Recording
 from tests.scenes.foreign import BALL, pusher, swing_up, thrown_ball, write_csv
 
+RIVALS_OF_DRAG = ("air_drag", "wind", "gravity_tilt", "time_base", "length_scale", "latency", "contact_compliance")
+"""Effects that a thrown ball could lack."""
+
 
 def read(make: Any, folder: Any) -> Recording:
     return read_csv(write_csv(make(), folder / make.__name__))
@@ -93,10 +96,13 @@ def test_friction_and_damping_of_a_swung_up_pendulum_are_found(tmp_path):
     assert values(found)["torque[hinge]"] == pytest.approx(0.03, rel=0.1)
 
 
-def test_drag_of_a_ball_that_is_tracked_by_position_is_found(tmp_path):
+@pytest.mark.parametrize(
+    "effects", [pytest.param((), marks=pytest.mark.slow, id="all"), pytest.param(RIVALS_OF_DRAG, id="rivals")]
+)
+def test_drag_of_a_ball_that_is_tracked_by_position_is_found(tmp_path, effects):
     recording = read(thrown_ball, tmp_path)
     assert recording.scene.count("framequat") == BALL.count("framequat") == 0
-    found = diagnosed(recording)
+    found = diagnosed(recording, effects=effects)
     assert found.groups == (("air_drag",),)
     check_saved(found, recording, tmp_path)
 

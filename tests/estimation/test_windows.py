@@ -210,7 +210,7 @@ def test_a_length_that_is_no_time_is_refused(scene, recording):
         cut_windows(scene, recording.demonstrations[0], ("cube",), 0.0)
 
 
-@pytest.mark.parametrize("factor", [0.95, 1.05])
+@pytest.mark.parametrize("factor", [pytest.param(0.95, marks=pytest.mark.slow), 1.05])
 def test_a_fit_to_tosses_recovers_the_edge_of_a_cube_whose_size_is_wrong(recording, factor):
     scene = Scene(toss_scene(factor * EDGE))
     start = Model(scene, ContactGeometryCfg(count=40, radius=0.0015).build(scene))

@@ -11,6 +11,7 @@ assert trained
 """Fixture."""
 CHILD = """
 import json, resource, signal, sys
+import pytest
 from concent_warp.cli import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -39,6 +40,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_training_that_finds_the_disk_full_leaves_the_earlier_one(trained, tmp_path):
     copied(trained, tmp_path)
     before = content(tmp_path)

@@ -32,6 +32,7 @@ def test_the_pose_is_found_from_the_robot_alone(filmed):
     assert not found.checks[0].off
 
 
+@pytest.mark.slow
 def test_depth_that_reads_too_long_is_found_and_does_not_move_the_pose(filmed):
     recording, truth = filmed
     demonstration = recording[0]
