@@ -5,13 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from test_checkpoint_files import copied, trained, training
 
 assert trained
 """Fixture."""
 CHILD = """
 import json, resource, signal, sys
-import pytest
 from concent_warp.cli import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 before = resource.getrlimit(resource.RLIMIT_FSIZE)
