@@ -95,7 +95,7 @@ class Procedure:
         given = self.baseline()
         runner.enter(BASELINE_DONE, ADDITIONS_DONE)
         with context.budget.until(SEARCH_SHARE):
-            given, fitted, detectable = self.search(given)
+            given, fitted, detectable = self.search_beside_impacts(given)
         revision = self.revision
         runner.enter(ADDITIONS_DONE, REVISION_DONE)
         fitted = revision.restore_given(revision.simplified(fitted), given)
@@ -104,7 +104,9 @@ class Procedure:
         runner.progress(1.0, "done")
         return found
 
-    def search(self, given: FittedModel) -> tuple[FittedModel, list[FittedModel], tuple[Detectable, ...]]:
+    def search_beside_impacts(
+        self, given: FittedModel
+    ) -> tuple[FittedModel, list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given, the same and after each addition, and the detectable sizes of all effects.
 
         Where errors of impacts are allowed for, the model as given is fitted to windows in which these count as noise.
@@ -112,12 +114,12 @@ class Procedure:
         left_open = "Open: what is missing where errors of impacts are allowed for."
         rough = self.context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given), None, left_open)
         if rough is None:
-            return given, *self._search(given)
+            return given, *self.search(given)
         context, begun = self.context, self.context.record.copy()
         beside, detectable = self._added([rough], rough, ())
         if len(beside) == 1 and beside[0] is rough:
             context.record = begun
-            return given, *self._search(given)
+            return given, *self.search(given)
         if not context.explains(beside[-1], rough, added=True):
             return rough, beside, detectable
         exact = self._with_exact_impacts(given, beside)
@@ -165,7 +167,7 @@ class Procedure:
         found = self._refitted(given.model, windows)
         return found if is_lacking(found, factors, cfg) else None
 
-    def _search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
+    def search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given and after each addition, and the detectable sizes of all effects."""
         budget, add_effects = self.context.budget, self.additions.add_effects
         attempt, detectable, fitted = budget.attempt, (), [given]

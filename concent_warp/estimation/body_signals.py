@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -14,7 +15,7 @@ from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame
 from concent_warp.estimation.signals import MeasuredBody, OrientationSignal, Signal
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.recording.recording import Channel
-from concent_warp.scene.sensor_frame import sensor_frame
+from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 
 if TYPE_CHECKING:
     from concent_warp.recording.recording import Demonstration
@@ -103,6 +104,7 @@ def spline_bodies(m: mujoco.MjModel, demonstration: Demonstration, cfg: Smoothin
         if kind in (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT)):
             frame = sensor_frame(m, row)
             if frame is not None:
+                channel = _in_world(frame, kind, channel)
                 posed.setdefault(frame.body, {}).setdefault(kind, (channel, frame.offset, frame.turn))
     for body, channels in posed.items():
         joint = m.body_jntadr[body]
@@ -125,3 +127,14 @@ def spline_bodies(m: mujoco.MjModel, demonstration: Demonstration, cfg: Smoothin
             addresses = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
             found[body] = MeasuredBody(name, body, *addresses, position, orientation)
     return tuple(found[body] for body in sorted(found))
+
+
+def _in_world(frame: SensorFrame, kind: int, channel: Channel) -> Channel:
+    """Return the measured poses of a frame in the world: positions, or orientations of the frame itself."""
+    if kind == int(SENSOR.mjSENS_FRAMEPOS):
+        return replace(channel, value=frame.place_in_world(channel.value))
+    value, valid = np.full(channel.value.shape, np.nan), np.isfinite(channel.value).all(axis=1)
+    if valid.any():
+        turned = frame.base_turn * Rotation.from_quat(channel.value[valid], scalar_first=True)
+        value[valid] = turned.as_quat(scalar_first=True)
+    return replace(channel, value=value)

@@ -145,11 +145,12 @@ def measured_pose(
 def frame_channel(
     model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor
 ) -> Channel | None:
-    """Return what was measured of a body's frame by a world-frame sensor of a kind, or None.
+    """Return what was measured of a body's frame in the world by a sensor of a kind, or None.
 
-    Sensors of another frame on the body, such as a marker's site, a geom or the centre of mass, count where none
-    measures the body's own: orientations are turned to the body's frame, positions moved to its origin by the
-    orientations measured at the same time. Velocities are those of the same origin only.
+    Sensors of another frame on the body, such as a marker's site, a geom or the centre of mass, and of any in a frame
+    that stands in the world, such as a camera's, count where none measures the body's own in the world: orientations
+    are turned, and positions moved to the body's origin by the orientations measured at the same time. Velocities are
+    those of the same origin in the world only.
     """
     found = _frame_channels(model, demonstration, body, kind)
     for frame, channel in found:
@@ -159,22 +160,25 @@ def frame_channel(
         if kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
             valid = np.isfinite(channel.value).all(axis=1)
             value = np.full(channel.value.shape, np.nan)
-            turned = Rotation.from_quat(channel.value[valid], scalar_first=True) * frame.turn.inv()
-            value[valid] = turned.as_quat(scalar_first=True)
+            if valid.any():
+                value[valid] = frame.body_in_world(channel.value[valid]).as_quat(scalar_first=True)
             return replace(channel, value=value)
-        if not frame.is_beside:
-            return channel
         if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
+            place = frame.place_in_world(channel.value)
+            if not frame.is_beside:
+                return replace(channel, value=place)
             turned = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEQUAT)
             if turned is not None and (rotation := _rotations(turned, channel.time)) is not None:
-                return replace(channel, value=channel.value - rotation.apply(frame.offset))
+                return replace(channel, value=place - rotation.apply(frame.offset))
+        elif not frame.is_beside and replace(frame, turn=Rotation.identity()).is_body:
+            return channel
     return None
 
 
 def _frame_channels(
     model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor
 ) -> list[tuple[SensorFrame, Channel]]:
-    """Return the measured channels of world-frame sensors of a kind on a body, each with its frame."""
+    """Return the measured channels of sensors of a kind on a body, each with its frame."""
     row, found = model.body(body).id, []
     for name, channel in demonstration.measured.items():
         sensor = model.sensor(name).id

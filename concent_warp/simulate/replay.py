@@ -113,11 +113,11 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
             value = [channel.value[k, i][0] if (k := known[:, i]).any() else np.nan for i in range(3)]
             framed.append((address, frame, np.array(value)))
         elif kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT and len(first):
-            turned = Rotation.from_quat(first[0], scalar_first=True) * frame.turn.inv()
-            qpos[address + 3 : address + 7] = turned.as_quat(scalar_first=True)
+            qpos[address + 3 : address + 7] = frame.body_in_world(first[0]).as_quat(scalar_first=True)
     # Of several frames on a body, its own says where it is.
     for address, frame, value in sorted(framed, key=lambda f: f[1].is_body):
-        place = value - Rotation.from_quat(qpos[address + 3 : address + 7], scalar_first=True).apply(frame.offset)
+        turned = Rotation.from_quat(qpos[address + 3 : address + 7], scalar_first=True)
+        place = frame.place_in_world(value) - turned.apply(frame.offset)
         seen = np.isfinite(place)
         qpos[address : address + 3][seen] = place[seen]
     return qpos, qvel

@@ -58,11 +58,14 @@ class Revision:
     def reconsidered(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, in the last one the effect of each addition that explains most beside the others.
 
-        The last addition has just been compared with its rivals beside all others.
+        The last addition has just been compared with its rivals beside all others, unless a shorter time step or
+        nominal values were adopted after it: what these explain was then left by all of them, and hid their differences
+        or was taken up by some.
         """
         context, record = self.context, self.context.record
         accepted = record.accepted()
-        for k, f in enumerate(accepted[:-1]):
+        compared = accepted[:-1] if len(fitted) < 2 or not _is_other(fitted[-2:]) else accepted
+        for k, f in enumerate(compared):
             among = record.rivals.get(f.step, ())[: context.cfg.search.reconsidered]
             if len(among) < 2:
                 continue

@@ -212,6 +212,33 @@ def test_earlier_additions_are_reconsidered_beside_later_ones(monkeypatch):
             assert made.record.findings[-1].parameters == parameters
 
 
+@pytest.mark.parametrize(
+    ("last", "again"),
+    [
+        ({}, []),
+        ({"timestep": FINER}, ["a"]),
+        ({"nominal": 2}, ["a"]),
+    ],
+)
+def test_the_last_addition_is_reconsidered_where_time_step_or_nominal_values_came_after_it(monkeypatch, last, again):
+    asked: list[Any] = []
+    made = procedure()
+    made.record.findings, made.record.groups = [finding("a", 0.5)], [("a",)]
+    made.record.rivals = {0: rivals(*"ab")}
+    monkeypatch.setattr(revision, "reconsider", lambda *args: asked.append(args))
+    made.revision.reconsidered([node(5), node(1.0, 100.0, effects=1, **last)])
+    assert [args[2][0].finding.name for args in asked] == again
+    assert [args[1] for args in asked] == [last.get("nominal", 0)] * len(again)
+
+
+def test_what_came_before_the_last_addition_is_no_reason_to_reconsider_it(monkeypatch):
+    monkeypatch.setattr(revision, "reconsider", lambda *_: pytest.fail("it has been compared beside all others"))
+    made = procedure()
+    made.record.findings, made.record.rivals = [finding("a", 0.5)], {0: rivals(*"ab")}
+    nodes = [node(5, timestep=FINER, nominal=2), node(1.0, 100.0, effects=1, timestep=FINER, nominal=2)]
+    assert made.revision.reconsidered(nodes) is nodes
+
+
 def test_no_more_rivals_are_reconsidered_than_asked_for(monkeypatch):
     asked: list[Any] = []
     made = procedure()
