@@ -9,6 +9,7 @@ import numpy as np
 
 from concent_warp.diagnosis.cfg import CheckDataCfg
 from concent_warp.estimation.noise import Noise
+from concent_warp.estimation.partial_state import partial_state
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.recording.recording import Recording
 
@@ -72,3 +73,28 @@ def noise_remarks(m: mujoco.MjModel, noises: Mapping[str, Noise]) -> list[str]:
         return []
     shown = ", ".join(said[:4]) + (f" and {len(said) - 4} more" if len(said) > 4 else "")
     return [f"Noise that is not stated was estimated from the readings alone: {shown}. State it where it is known."]
+
+
+def start_remarks(m: mujoco.MjModel, recording: Recording) -> list[str]:
+    """Return a sentence on the free bodies of which nothing says where they are at the start; none where there is none.
+
+    Args:
+        m: The compiled model.
+        recording: The recording.
+    """
+    unseen = []
+    for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        first, name = int(m.jnt_dofadr[joint]), m.body(int(m.jnt_bodyid[joint])).name
+        told = [
+            d.qpos is not None or name in d.points or bool(partial_state(m, d, 0.0).measured[first : first + 6].any())
+            for d in recording.demonstrations
+        ]
+        if not all(told):
+            unseen.append(name or f"body{int(m.jnt_bodyid[joint])}")
+    if not unseen:
+        return []
+    return [
+        f"Nothing says where {', '.join(unseen)} starts: simulations begin with it at rest in the scene's reference"
+        " pose. Measure its position by a sensor of its frame, or a marker's position and orientation, or give the"
+        " initial state."
+    ]

@@ -19,7 +19,7 @@ from concent_warp.diagnosis.candidates.baseline import fit_baseline
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.check_data import check_data, noise_remarks
+from concent_warp.diagnosis.check_data import check_data, noise_remarks, start_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
@@ -90,7 +90,9 @@ class Procedure:
         context, cfg, runner = self.context, self.context.cfg, self.context.runner
         noises = instrument_noise(self.model.compile(), self.recording.demonstrations)
         context.noise_factors = {channel: noise.factor for channel, noise in noises.items()}
-        issues = [*check_data(self.recording, cfg.data), *noise_remarks(self.model.compile(), noises)]
+        compiled = self.model.compile()
+        issues = [*check_data(self.recording, cfg.data), *noise_remarks(compiled, noises)]
+        issues += start_remarks(compiled, self.recording)
         runner.progress(0.0, "cutting windows")
         given = self.baseline()
         runner.enter(BASELINE_DONE, ADDITIONS_DONE)

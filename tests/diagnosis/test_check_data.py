@@ -1,11 +1,12 @@
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.diagnosis.cfg import CheckDataCfg
-from concent_warp.diagnosis.check_data import _is_white, check_data
-from concent_warp.recording.recording import Channel
+from concent_warp.diagnosis.check_data import _is_white, check_data, start_remarks
+from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from tests.scenes.swinging import swung
 
 
@@ -105,3 +106,35 @@ def test_readings_are_white_where_all_that_move_differ_as_independent_ones():
     ratio = np.mean(np.diff(white, axis=0) ** 2) / white.var()
     assert _is_white(white, replace(cfg, white_noise_ratio=ratio / 2 * 0.999))
     assert not _is_white(white, replace(cfg, white_noise_ratio=ratio / 2 * 1.001))
+
+
+BALLS = """
+<mujoco>
+  <worldbody>
+    <body name="seen"><freejoint/><geom size="0.1"/><site name="mark" pos="0.1 0 0"/></body>
+    <body name="other" pos="1 0 0"><freejoint/><geom size="0.1"/></body>
+  </worldbody>
+  <sensor>
+    <framepos name="seen" objtype="xbody" objname="seen"/>
+    <framepos name="mark" objtype="site" objname="mark"/>
+    <framepos name="other" objtype="xbody" objname="other"/>
+  </sensor>
+</mujoco>"""
+
+
+def fallen(*names: str, **given) -> Recording:
+    channel = Channel(np.arange(10) / 100, np.zeros((10, 3)))
+    return Recording(BALLS, (Demonstration("drop", measured=dict.fromkeys(names, channel), **given),))
+
+
+def test_a_body_of_which_nothing_says_where_it_starts_is_remarked_on():
+    m = mujoco.MjModel.from_xml_string(BALLS)
+    (said,) = start_remarks(m, fallen("seen"))
+    assert "where other starts" in said
+    # A marker beside the origin tells nothing without the orientation.
+    (said,) = start_remarks(m, fallen("mark", "other"))
+    assert "where seen starts" in said
+    assert start_remarks(m, fallen("seen", "other")) == []
+    assert start_remarks(m, fallen("seen", qpos=m.qpos0, qvel=np.zeros(m.nv))) == []
+    track = PointTrack(np.arange(2.0), np.zeros((2, 3, 3)), np.ones((2, 3), dtype=bool))
+    assert start_remarks(m, fallen("seen", points={"other": track})) == []

@@ -8,8 +8,10 @@ import pytest
 
 import concent_warp as cw
 from concent_warp.effects.select import shown_free_joint
+from concent_warp.estimation.body_signals import spline_bodies
 from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.estimation.partial_state import partial_state
+from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.fit.effects.observation import start_spread
 from concent_warp.recording.recording import Channel, Demonstration
@@ -25,6 +27,8 @@ FRAMES = {
     "site": "marker",
     "camera": "eye",
 }
+KINDS = (*FRAMES, "lens")
+"""Frames on the box, and a marker on it in the frame of a camera that stands."""
 SENSORS = "".join(
     f'<framepos name="{kind}_p" objtype="{kind}" objname="{name}"/>'
     f'<framequat name="{kind}_q" objtype="{kind}" objname="{name}"/>'
@@ -34,6 +38,10 @@ SCENE = f"""
 <mujoco>
   <option timestep="0.001"/>
   <worldbody>
+    <body name="stand" pos="0.4 -1 0.2" euler="0 0 50">
+      <geom size="0.01"/>
+      <camera name="lens" pos="0.1 0 0.3" euler="70 20 0"/>
+    </body>
     <body name="box" pos="0 0 1">
       <freejoint/>
       <inertial mass="0.2" pos="0.01 0.02 -0.01" quat="0.9 0.1 0.3 -0.2" diaginertia="1e-4 2e-4 3e-4"/>
@@ -43,6 +51,8 @@ SCENE = f"""
     </body>
   </worldbody>
   <sensor>{SENSORS}
+    <framepos name="lens_p" objtype="site" objname="marker" reftype="camera" refname="lens"/>
+    <framequat name="lens_q" objtype="site" objname="marker" reftype="camera" refname="lens"/>
     <framepos name="seen" objtype="site" objname="marker" reftype="camera" refname="eye"/>
   </sensor>
 </mujoco>"""
@@ -80,7 +90,7 @@ def same_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return 1 - np.abs((a * b).sum(axis=-1))
 
 
-@pytest.mark.parametrize("kind", FRAMES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_poses_of_any_frame_on_a_body_are_those_of_the_body(tumbling, kind):
     scene, channels, qpos, _ = tumbling
     seen = demonstration(channels, f"{kind}_p", f"{kind}_q")
@@ -95,7 +105,7 @@ def test_poses_of_any_frame_on_a_body_are_those_of_the_body(tumbling, kind):
         assert np.abs(channels[f"{kind}_p"].value - qpos[:, :3]).max() > 0.01
 
 
-@pytest.mark.parametrize("kind", FRAMES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_states_are_estimated_from_any_frame(tumbling, kind):
     scene, channels, qpos, qvel = tumbling
     seen = demonstration(channels, f"{kind}_p", f"{kind}_q")
@@ -115,6 +125,15 @@ def test_a_marker_without_orientation_tells_of_the_origin_only_where_it_is_there
     there = frame_channel(ball.model, demonstration(channels, "site_p"), "box", POSITION)
     assert there is not None
     np.testing.assert_allclose(there.value, channels["site_p"].value)
+
+
+def test_smoothing_splines_take_any_frame_as_well(tumbling):
+    scene, channels, qpos, _ = tumbling
+    for kind in KINDS:
+        seen = demonstration(channels, f"{kind}_p", f"{kind}_q")
+        (body,) = spline_bodies(scene.model, seen, SmoothingSplineCfg())
+        found = body.position.estimate(np.array([0.1, 0.15])).value
+        np.testing.assert_allclose(found, qpos[[20, 30], :3], atol=1e-4, err_msg=kind)
 
 
 def test_the_orientation_may_be_of_another_frame_than_the_position(tumbling):
@@ -145,7 +164,7 @@ def test_the_bodys_own_frame_comes_first(tumbling):
     assert frame_channel(scene.model, seen, "box", ORIENTATION) is channels["xbody_q"]
 
 
-@pytest.mark.parametrize("kind", FRAMES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_a_sensor_of_any_frame_shows_is_known_to_its_noise(tumbling, kind):
     m = tumbling[0].model
     spread, none = start_spread(m, {f"{kind}_p": 1e-3, f"{kind}_q": 1e-3}), start_spread(m, {})
@@ -154,7 +173,7 @@ def test_what_a_sensor_of_any_frame_shows_is_known_to_its_noise(tumbling, kind):
     assert shown_free_joint(m, m.sensor(f"{kind}_p").id) == 0
 
 
-def test_a_frame_relative_to_another_is_none_of_the_world(tumbling):
+def test_a_frame_relative_to_one_that_moves_is_none_of_the_world(tumbling):
     m = tumbling[0].model
     assert sensor_frame(m, m.sensor("seen").id) is None
     assert shown_free_joint(m, m.sensor("seen").id) is None
