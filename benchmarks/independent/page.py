@@ -78,14 +78,14 @@ def page(rows: Sequence[Row], earlier: Sequence[Row], every: Sequence[DataSet], 
     parts = [
         f"""# Diagnoses on independent worlds
 
-{textwrap.fill(introduction, 120)}
+{textwrap.fill(introduction, 120, break_on_hyphens=False)}
 
-{textwrap.fill(split, 120)}
+{textwrap.fill(split, 120, break_on_hyphens=False)}
 
 *Exactly right*: the effects that are there and nothing else, each named alone or in a group of at most two. No effect
 counts for another one. Square brackets have Wilson's 95 % intervals.
 
-{textwrap.fill(measured, 120)}
+{textwrap.fill(measured, 120, break_on_hyphens=False)}
 """,
         _figures(development, locked, before),
     ]

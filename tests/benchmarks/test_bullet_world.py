@@ -207,7 +207,7 @@ def test_noise_is_stated_as_the_data_set_says_and_always_held_out():
     check_that_noise_is_stated_as_the_set_says(BULLET, "bullet-shove-null-0")
 
 
-@pytest.mark.parametrize("name", ["bullet-cart-joint_damping-large", "bullet-ramp-rolling_friction-large"])
+@pytest.mark.parametrize("name", ["bullet-cart-joint_damping-large", "bullet-lift-joint_friction-large"])
 def test_the_library_does_not_reproduce_the_world_exactly_but_comes_nearer(name):
     from benchmarks.diagnose.hidden_effects_residual import ratios
     from concent_warp.model import Model
