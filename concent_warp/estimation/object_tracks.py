@@ -181,8 +181,8 @@ def _frame_channels(
     """Return the measured channels of sensors of a kind on a body, each with its frame."""
     row, found = model.body(body).id, []
     for name, channel in demonstration.measured.items():
-        sensor = model.sensor(name).id
-        if int(model.sensor_type[sensor]) != int(kind):
+        sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        if sensor < 0 or int(model.sensor_type[sensor]) != int(kind):
             continue
         frame = sensor_frame(model, sensor)
         if frame is not None and frame.body == row:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from concent_warp.estimation.body_signals import POSE_SENSORS
+from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.report.scene_data import packed
 from concent_warp.simulate.replay import interpolate, replay
 
@@ -60,17 +62,13 @@ def motion_data(
 
 def _measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time: np.ndarray) -> dict[str, np.ndarray]:
     """Return the measured poses (T, 7) at `time` (T,) of the bodies that move and were measured in full."""
-    found: dict[str, dict[int, Channel]] = {}
-    for name, channel in demonstration.measured.items():
-        row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
-        if row >= 0 and int(compiled.sensor_objtype[row]) == mujoco.mjtObj.mjOBJ_XBODY:
-            body = compiled.body(compiled.sensor_objid[row]).name
-            found.setdefault(body, {})[int(compiled.sensor_type[row])] = channel
     poses = {}
-    for body, channels in found.items():
-        position = channels.get(int(mujoco.mjtSensor.mjSENS_FRAMEPOS))
-        rotation = channels.get(int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
-        if position is not None and rotation is not None and _moves(compiled, body):
+    for b in range(1, compiled.nbody):
+        body = compiled.body(b).name
+        if not body or not _moves(compiled, body):
+            continue
+        position, rotation = (frame_channel(compiled, demonstration, body, kind) for kind in POSE_SENSORS)
+        if position is not None and rotation is not None:
             quaternion = _resampled(rotation, time, align=True)
             quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
             poses[body] = np.concatenate([_resampled(position, time), quaternion], axis=1)

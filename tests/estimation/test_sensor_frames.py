@@ -15,6 +15,7 @@ from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.fit.effects.observation import start_spread
 from concent_warp.recording.recording import Channel, Demonstration
+from concent_warp.report.motion_data import _measured_poses
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.sensor_frame import sensor_frame
 from concent_warp.simulate.replay import initial_state
@@ -134,6 +135,22 @@ def test_smoothing_splines_take_any_frame_as_well(tumbling):
         (body,) = spline_bodies(scene.model, seen, SmoothingSplineCfg())
         found = body.position.estimate(np.array([0.1, 0.15])).value
         np.testing.assert_allclose(found, qpos[[20, 30], :3], atol=1e-4, err_msg=kind)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_page_shows_the_body_where_it_was_measured(tumbling, kind):
+    scene, channels, qpos, _ = tumbling
+    seen = demonstration(channels, f"{kind}_p", f"{kind}_q")
+    (body, pose), *rest = _measured_poses(scene.model, seen, np.array([0.1, 0.15])).items()
+    assert (body, rest) == ("box", [])
+    np.testing.assert_allclose(pose[:, :3], qpos[[20, 30], :3], atol=1e-9)
+    assert same_turn(pose[:, 3:], qpos[[20, 30], 3:]).max() < 1e-12
+
+
+def test_a_channel_of_no_sensor_is_of_no_body(tumbling):
+    scene, channels, _, _ = tumbling
+    seen = Demonstration("throw", measured={"nowhere": channels["xbody_p"]})
+    assert frame_channel(scene.model, seen, "box", POSITION) is None
 
 
 def test_the_orientation_may_be_of_another_frame_than_the_position(tumbling):
