@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -60,8 +61,12 @@ class Scene:
         return _standalone(spec.copy(), source)
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a fresh spec that the caller may edit."""
-        return spec_from_text(self.xml, self.source)
+        """Return a fresh spec that the caller may edit.
+
+        Bodies and joints without a name are called "body3", "joint2", by their indices: whatever concerns a single one
+        of them refers to it by name.
+        """
+        return _named(spec_from_text(self.xml, self.source))
 
     def with_timestep(self, timestep: float) -> Scene:
         """Return the scene with another time step [s]."""
@@ -128,6 +133,32 @@ class Scene:
                 f"<numeric name={GOAL_NUMERIC!r}> is no place", where=self.source, expected="x y z in m", found=found
             )
         return found
+
+
+def _named(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Return a spec, which is changed, with names for all bodies and joints."""
+    bodies, joints = list(_tree(spec.worldbody))[1:], []
+    for body in bodies:
+        joints += list(body.joints)
+    for kind, elements, first in (("body", bodies, 1), ("joint", joints, 0)):
+        taken = {element.name for element in elements}
+        for i, element in enumerate(elements, start=first):
+            if not element.name:
+                name = f"{kind}{i}"
+                while name in taken:
+                    name += "_"
+                element.name = name
+                taken.add(name)
+    return spec
+
+
+def _tree(body: mujoco.MjsBody) -> Iterator[mujoco.MjsBody]:
+    """Yield a body and those that hang on it, depth first, as the compiler counts them."""
+    waiting = [body]
+    while waiting:
+        found = waiting.pop()
+        yield found
+        waiting += reversed(list(found.bodies))
 
 
 def _standalone(spec: mujoco.MjSpec, source: str) -> Scene:
