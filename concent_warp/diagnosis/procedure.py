@@ -111,46 +111,26 @@ class Procedure:
     ) -> tuple[FittedModel, list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given, the same and after each addition, and the detectable sizes of all effects.
 
-        Where errors of impacts are allowed for, the model as given is fitted to windows in which these count as noise.
+        Where these do not explain the data, the search is repeated with errors of impacts among the noise. What it
+        finds counts where it explains the data; the model as given is then fitted to windows with such errors, too.
         """
-        left_open = "Open: what is missing where errors of impacts are allowed for."
-        rough = self.context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given), None, left_open)
-        if rough is None:
-            return given, *self.search(given)
         context, begun = self.context, self.context.record.copy()
-        beside, detectable = self._added([rough], rough, ())
-        if len(beside) == 1 and beside[0] is rough:
-            context.record = begun
-            return given, *self.search(given)
-        if not context.explains(beside[-1], rough, added=True):
-            return rough, beside, detectable
-        exact = self._with_exact_impacts(given, beside)
-        if exact is not None:
-            return given, exact, detectable
-        self.impacts_left = True
-        return rough, beside, detectable
-
-    def _with_exact_impacts(self, given: FittedModel, beside: Sequence[FittedModel]) -> list[FittedModel] | None:
-        """Return the search continued from its result where impacts have errors, None where it explains no more.
-
-        Effects of contact show in what follows impacts, and are found only without such errors.
-
-        Args:
-            given: The model as given, without errors of impacts.
-            beside: The model as given and after each addition, with them.
-        """
-        context = self.context
+        fitted, detectable = self.search(given)
+        if context.explains(fitted[-1], given, added=bool(self.record.accepted())):
+            return given, fitted, detectable
+        left_open = "Open: what is missing where errors of impacts are allowed for."
+        rough = context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given), None, left_open)
+        if rough is None:
+            return given, fitted, detectable
         budget, settled = context.budget, context.record
-        cut, unsettled = set(budget.cut), list(budget.unsettled)
-        context.record = settled.copy()
-        context.record.time_step = None
-        found = budget.attempt(lambda: self.carry_over(given, beside), [], "")
-        if len(found) == len(beside):
-            found, _ = self._added(found, given, ())
-            if context.explains(found[-1], given, added=True):
-                return found
+        cut, unsettled = budget.cut, budget.unsettled
+        context.record, budget.cut, budget.unsettled = begun, set(), []
+        beside, smallest = self._added([rough], rough, ())
+        if self.record.accepted() and not budget.cut and context.explains(beside[-1], rough, added=True):
+            self.impacts_left = True
+            return rough, beside, smallest
         context.record, budget.cut, budget.unsettled = settled, cut, unsettled
-        return None
+        return given, fitted, detectable
 
     def baseline_with_errors_of_impacts(self, given: FittedModel) -> FittedModel | None:
         """Return the model as given where errors of impacts count as noise; None where that leaves nothing to explain.
