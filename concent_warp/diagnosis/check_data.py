@@ -90,7 +90,7 @@ def start_remarks(m: mujoco.MjModel, recording: Recording) -> list[str]:
             for d in recording.demonstrations
         ]
         if not all(told):
-            unseen.append(name or f"body{int(m.jnt_bodyid[joint])}")
+            unseen.append(name)
     if not unseen:
         return []
     return [

@@ -250,15 +250,18 @@ class Procedure:
         self.noise_scale = found.noise_ratio / search.contact_ratio
         return self._refitted(self.model, self._windows(self.model, cfg.window))
 
-    def _windows(self, model: Model, length: float | None, impact_error: float = 0.0) -> Sequence[Window]:
+    def _windows(self, model: Model, length: float | None, impact_error: float | None = None) -> Sequence[Window]:
         """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None.
 
         Args:
             model: The model.
             length: The length [s].
-            impact_error: See `ObservationCfg.impact_error`.
+            impact_error: See `ObservationCfg.impact_error`; by default as there.
         """
         cfg = self.context.cfg
+        observation = cfg.fits.observation
+        if impact_error is not None:
+            observation = replace(observation, impact_error=impact_error)
         windows = observe(
             model,
             self.recording,
@@ -266,7 +269,7 @@ class Procedure:
             noise={channel: self.noise_scale * std for channel, std in self.noise.items()},
             engine=self.engine,
             seed=cfg.seed,
-            cfg=replace(cfg.fits.observation, impact_error=impact_error),
+            cfg=observation,
         )
         return [replace(w, noise_scale=self.noise_scale) for w in windows]
 

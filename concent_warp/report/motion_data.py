@@ -65,7 +65,7 @@ def _measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time
     poses = {}
     for b in range(1, compiled.nbody):
         body = compiled.body(b).name
-        if not body or not _moves(compiled, body):
+        if not _moves(compiled, body):
             continue
         position, rotation = (frame_channel(compiled, demonstration, body, kind) for kind in POSE_SENSORS)
         if position is not None and rotation is not None:

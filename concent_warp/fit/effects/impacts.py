@@ -1,10 +1,9 @@
 """Impacts: what a contact law leaves open of them, as correlated noise of what follows.
 
-Laws of rigid contact foretell velocities after an impact to a few percent of their change at best: measured impacts of
-one body differ among themselves by that much (Fazeli et al., "Empirical evaluation of common contact models for planar
-impact", ICRA 2017), and simulators with the same parameters differ, too. Over a longer flight, a small error of that
-kind exceeds the noise of any tracker. It is no missing effect, and it is independent from impact to impact: the changes
-of the residuals by such errors are deviations as those of the numerical scatter (`NumericalScatter`).
+No law of rigid contact foretells the velocities after an impact exactly, and simulators with the same parameters
+differ in them. In flight, a small error of that kind soon exceeds the noise of a tracker. It is no missing effect, and
+it is taken as independent from impact to impact: the changes of the residuals by such errors are deviations as those of
+the numerical scatter (`NumericalScatter`).
 """
 
 from __future__ import annotations
@@ -79,11 +78,13 @@ def impacts(m: mujoco.MjModel, course: Course, cfg: ObservationCfg) -> Iterator[
     flown, lasting = (max(round(t / step), 1) for t in (cfg.impact_flight, cfg.impact_duration))
     for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
         body, dof = int(m.jnt_bodyid[joint]), int(m.jnt_dofadr[joint])
+        if m.body_mass[body] <= 0:  # its mass is in bodies that are fixed to it
+            continue
         velocity = _center_velocity(m, body, course.qpos[:, m.jnt_qposadr[joint] + 3 :], course.qvel[:, dof : dof + 6])
         turning = course.qvel[:, dof + 3 : dof + 6]
         pushed = np.linalg.norm(np.diff(velocity, axis=0) / step - gravity, axis=1)
         touching = pushed > cfg.impact_acceleration * max(float(np.linalg.norm(gravity)), 1.0)
-        radius = np.sqrt(m.body_inertia[body] / max(m.body_mass[body], 1e-12))
+        radius = np.sqrt(m.body_inertia[body] / m.body_mass[body])
         for begin in np.flatnonzero(touching[1:] & ~touching[:-1]) + 1:
             if begin < flown or touching[begin - flown : begin].any():
                 continue
