@@ -79,6 +79,11 @@ def main(args: Args) -> None:
     check(args, every)
     args.out.mkdir(parents=True, exist_ok=True)
     chosen = [c for c in every if wanted(c, args)]
+    if not chosen:
+        raise SystemExit(
+            "independent benchmark: no data set is of all that was asked for; locked ones are diagnosed with --locked"
+            " only"
+        )
     if not args.report:
         run(chosen, args)
     merge(args.out, every)

@@ -13,7 +13,7 @@ from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.estimation.partial_state import partial_state
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.estimation.state_estimator import StateEstimator
-from concent_warp.fit.effects.observation import start_spread
+from concent_warp.fit.effects.observation import ObservationCfg, start_spread
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.report.motion_data import _measured_poses
 from concent_warp.scene.scene import Scene
@@ -188,6 +188,16 @@ def test_what_a_sensor_of_any_frame_shows_is_known_to_its_noise(tumbling, kind):
     assert (spread != none).all()
     np.testing.assert_allclose(spread, start_spread(m, {"xbody_p": 1e-3, "xbody_q": 1e-3}))
     assert shown_free_joint(m, m.sensor(f"{kind}_p").id) == 0
+
+
+def test_the_start_of_a_body_whose_marker_alone_was_seen_is_far_from_certain(tumbling):
+    m, cfg, unseen = tumbling[0].model, ObservationCfg(), np.zeros(6, dtype=bool)
+    found = start_spread(m, {"site_p": 1e-3}, measured=unseen)
+    position, orientation = [cfg.unknown_position] * 3, [cfg.unknown_orientation] * 3
+    velocity, spin = [cfg.unknown_velocity] * 3, [cfg.unknown_spin] * 3
+    np.testing.assert_allclose(found, [*position, *orientation, *velocity, *spin])
+    # Of a body that nothing shows at all, nothing is fitted that would explain anything.
+    assert (start_spread(m, {}, measured=unseen) < found).all()
 
 
 def test_a_frame_relative_to_one_that_moves_is_none_of_the_world(tumbling):

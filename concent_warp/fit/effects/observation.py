@@ -265,14 +265,16 @@ def start_spread(
         noise: Standard deviation of a component of each channel.
         cfg: Settings.
         measured: Which degrees of freedom were measured, shape (nv,) bool; as the channels say by default. Those that
-            were not, of free bodies of which others were, are far more uncertain.
+            were not, of free bodies of which others were or a marker was seen, are far more uncertain.
     """
     cfg = cfg or ObservationCfg()
+    frames = {row: frame for name in noise if (frame := sensor_frame(m, row := int(m.sensor(name).id))) is not None}
+    seen_bodies = {frame.body for frame in frames.values()}
     position, velocity = np.full(m.nv, cfg.unmeasured_position), np.full(m.nv, cfg.unmeasured_velocity)
     if measured is not None:
         for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
             dof = int(m.jnt_dofadr[joint])
-            if measured[dof : dof + 6].any():
+            if measured[dof : dof + 6].any() or int(m.jnt_bodyid[joint]) in seen_bodies:
                 position[dof : dof + 3], position[dof + 3 : dof + 6] = cfg.unknown_position, cfg.unknown_orientation
                 velocity[dof : dof + 3], velocity[dof + 3 : dof + 6] = cfg.unknown_velocity, cfg.unknown_spin
 
@@ -295,9 +297,9 @@ def start_spread(
                     dof = int(m.jnt_dofadr[m.wrap_objid[w]])
                     seen(slice(dof, dof + 1), std)
         elif kind in (int(mujoco.mjtSensor.mjSENS_FRAMEPOS), int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)):
-            if (frame := sensor_frame(m, row)) is None:
+            if row not in frames:
                 continue
-            joint = int(m.body_jntadr[frame.body])
+            joint = int(m.body_jntadr[frames[row].body])
             if joint < 0 or m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
                 continue
             dof = int(m.jnt_dofadr[joint]) + 3 * (kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
