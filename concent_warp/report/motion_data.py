@@ -31,8 +31,17 @@ def motion_data(
     engines: Mapping[str, Engine],
     demonstration: Demonstration,
     bodies: Sequence[str],
+    begun: Mapping[str, Demonstration] | None = None,
 ) -> dict[str, Any]:
-    """Return the replay of a demonstration in each model, beside what was measured, at common times."""
+    """Return the replay of a demonstration in each model, beside what was measured, at common times.
+
+    Args:
+        models: The models by name.
+        engines: What simulates them.
+        demonstration: What was commanded and measured.
+        bodies: Names of the bodies that are shown.
+        begun: The demonstration with the initial state of each model's replay, by model; by default as it states it.
+    """
     duration = demonstration.duration
     count = int(np.clip(np.ceil(duration * RATE) + 1, 2, MOST_FRAMES))
     time = np.linspace(0, duration, count)
@@ -40,7 +49,8 @@ def motion_data(
     for name, model in models.items():
         engine = engines[name]
         steps = np.unique(np.round(time / engine.timestep).astype(int))
-        rollout = replay(model, demonstration, engine, record=steps, bodies=bodies).numpy()
+        started = demonstration if begun is None else begun[name]
+        rollout = replay(model, started, engine, record=steps, bodies=bodies).numpy()
         rows = np.searchsorted(rollout.time, time - engine.timestep / 2).clip(0, len(rollout.time) - 1)
         pose = np.concatenate([rollout.body_position[0], rollout.body_quaternion[0]], axis=2)
         poses[name], qpos = packed(pose[rows]), rollout.qpos[0][rows]

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from concent_warp.comparison.initial_states import with_initial_states
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.units import DISPLAY_UNITS, channel_text, unit_text
 from concent_warp.comparison.worst_spans import WorstSpan, whole_rows
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.recording.recording import Recording
 from concent_warp.report.headline import headline_channel
 from concent_warp.report.motion_data import motion_data
 from concent_warp.report.opening import first_demonstration, openings
@@ -45,6 +47,10 @@ def page_data(
     names = [body["name"] for body in bodies]
     engines = {name: make_engine("mujoco", model) for name, model in models.items()}
     opened = openings(comparison, [d.name for d in demonstrations])
+    begun = {
+        name: with_initial_states(model, Recording(model.scene.xml, tuple(demonstrations))).demonstrations
+        for name, model in models.items()
+    }
     found = [
         {
             "name": d.name,
@@ -53,10 +59,10 @@ def page_data(
             "phases": _phase_bands(comparison, d),
             "channels": _channel_lines(comparison, d.name),
             "schedule": _schedule_data(events[d.name]) if d.name in events else None,
-            "motion": motion_data(models, engines, d, names),
+            "motion": motion_data(models, engines, d, names, {name: of[k] for name, of in begun.items()}),
             "opening": {"channel": opened[d.name].channel, "time": opened[d.name].time},
         }
-        for d in demonstrations
+        for k, d in enumerate(demonstrations)
     ]
     return {
         "models": [{"name": name, "kind": kind_of(comparison, name)} for name in comparison.models],

@@ -95,7 +95,8 @@ def write_report(
         ),
         "schedule": page_file("schedule.html") if events else "",
         "replay_about": (
-            "The recorded commands, simulated open loop from the recorded initial state. "
+            "The recorded commands, simulated open loop from the initial state that is recorded, or else from the one "
+            "that follows the first readings best. "
             "Green: the measured pose of the objects, or the tracked points where no pose was measured."
         ),
         "follow_options": options(_follow_order(data, comparison)) + '<option value="">the scene</option>',

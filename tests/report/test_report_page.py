@@ -20,6 +20,7 @@ from concent_warp.report.scene_data import scene_bodies
 from concent_warp.report.template import filled
 from concent_warp.report.worst_spans import numbered_spans, shown_demonstrations
 from concent_warp.scene.scene import Scene
+from tests.scene.test_unnamed import thrown
 
 PENDULUM = """
 <mujoco>
@@ -293,3 +294,16 @@ def test_the_overlap_card_says_what_a_change_means(after, note):
     found = _overlap_note(0.41, after, 0.02)
     assert note in found
     assert bool(found) == bool(note)
+
+
+def test_the_replay_begins_as_the_comparison_does_where_no_initial_state_is_recorded(tmp_path):
+    recording = thrown()
+    assert recording.demonstrations[0].qvel is None
+    models = {"model": Model(Scene(recording.scene))}
+    write_report(tmp_path / "r.html", recording, compare_replays(models, recording, "mujoco"))
+    page = embedded(tmp_path / "r.html")
+    motion, names = page["demonstrations"][0]["motion"], [body["name"] for body in page["bodies"]]
+    simulated = unpacked(motion["poses"]["model"]).reshape(-1, len(names), 7)[:, names.index("body1"), :3]
+    measured = unpacked(motion["measured"]["body1"]).reshape(-1, 7)[:, :3]
+    assert np.ptp(measured[:, 0]) > 0.1  # thrown, not dropped
+    assert np.abs(simulated - measured).max() < 5e-3
