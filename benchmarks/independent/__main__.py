@@ -3,6 +3,7 @@
 python -m benchmarks.independent                                  # development sets that are not done, the page
 python -m benchmarks.independent --kinds null --rigs drop         # some of them
 python -m benchmarks.independent --locked --out runs/locked       # the locked sets, once, at the end
+python -m benchmarks.independent --recordings FOLDER              # of recordings that were made elsewhere
 python -m benchmarks.independent --report                         # the page from what is done
 python -m benchmarks.independent --report --earlier OTHER/results.jsonl --locked-results LOCKED/results.jsonl
 
@@ -29,6 +30,7 @@ import numpy as np
 import tyro
 
 from benchmarks.independent.data_set import KINDS, DataSet, Kind, World
+from benchmarks.independent.kept_data import is_kept
 from benchmarks.independent.page import read_results, write_page_from
 from benchmarks.independent.scoring import line
 from benchmarks.independent.split import locked_names
@@ -63,6 +65,8 @@ class Args:
     """Duration of a diagnosis from which on it counts as wrong [s]."""
     out: Path = OUT
     """Folder of the results."""
+    recordings: Path | None = None
+    """Folder of data sets that `benchmarks.independent.data_sets --save` wrote; what it lacks is made here."""
     report: bool = False
     """Write the page from what is done, and diagnose nothing."""
     earlier: Path | None = None
@@ -110,6 +114,11 @@ def check(args: Args, every: Sequence[DataSet]) -> None:
     for option, number in (("--jobs", args.jobs), ("--cores", args.cores), ("--limit", args.limit)):
         if not 0 < number < float("inf"):
             raise SystemExit(f"independent benchmark: {option} must be a positive number; found {number:g}")
+    if args.recordings is not None and not args.recordings.is_dir():
+        raise SystemExit(
+            f"independent benchmark: --recordings {args.recordings}: no such folder; write one by python -m"
+            " benchmarks.independent.data_sets --save FOLDER"
+        )
     for option, file in (("--earlier", args.earlier), ("--locked-results", args.locked_results)):
         if file is not None and not file.is_file():
             raise SystemExit(f"independent benchmark: {option} {file}: no such file; give the results.jsonl of a run")
@@ -130,10 +139,11 @@ def run(chosen: Sequence[DataSet], args: Args) -> None:
     """Diagnose what is not done yet."""
     pending = [c for c in chosen if not path(args.out, c.name).is_file()]
     for world, module, package in (("drake", "pydrake", "drake"), ("bullet", "pybullet", "pybullet")):
-        if any(c.world == world for c in pending) and find_spec(module) is None:
+        if any(c.world == world and not is_kept(c, args.recordings) for c in pending) and find_spec(module) is None:
             raise SystemExit(
                 f"independent benchmark: the world on {world.capitalize()} needs the package {package}, which is not"
-                " installed; install the extra concent-warp[benchmarks], or leave that world out with --world mujoco"
+                " installed; install the extra concent-warp[benchmarks], leave that world out with --world mujoco, or"
+                " give --recordings made where it is"
             )
     random.Random(0).shuffle(pending)  # what is done when it is stopped is a fair part of the whole
     done: dict[str, list[float]] = {}
@@ -164,6 +174,7 @@ def in_process(case: DataSet, args: Args, commit: str) -> tuple[dict[str, Any], 
     begun = time.monotonic()
     command = [sys.executable, "-m", "benchmarks.independent.study", case.name, str(args.out), "--commit", commit]
     command += ["--limit", str(args.limit), "--cores", str(args.cores)]
+    command += [] if args.recordings is None else ["--recordings", str(args.recordings)]
     places = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     said = ""

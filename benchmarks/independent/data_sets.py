@@ -2,23 +2,27 @@
 
 python -m benchmarks.independent.data_sets --list                  # names only; nothing is made
 python -m benchmarks.independent.data_sets --kinds null --rigs arm # residuals of some sets
+python -m benchmarks.independent.data_sets --save FOLDER           # recordings, for a machine without Drake or Bullet
 
 The table has, for each data set, the time to make it, and the root mean square of residual over noise in the channel
 where it is largest, initial states refitted: of the nominal model, and of the nominal model with the library's effects
-at their true values, where these exist. Locked sets are not made.
+at their true values, where these exist. Locked sets are not shown, and made with `--save` and `--locked` only.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import tyro
 
 from benchmarks.diagnose.hidden_effects_residual import ratios
 from benchmarks.independent.data_set import KINDS, WORLDS, Data, DataSet, Kind, World
+from benchmarks.independent.kept_data import is_kept, save
 from benchmarks.independent.split import locked_by_rule
 from benchmarks.independent.worlds import all_sets, make
 from concent_warp.effects.registry import effect_class
@@ -38,6 +42,10 @@ class Args:
     world: World | None = None
     names: tuple[str, ...] = ()
     """Only data sets of these names."""
+    save: Path | None = None
+    """Write the recordings to this folder, those that it lacks, and print no residuals."""
+    locked: bool = False
+    """Write the locked sets, and no others."""
 
 
 def main(args: Args) -> None:
@@ -53,6 +61,9 @@ def main(args: Args) -> None:
                 locked, rest = counts[world, kind, True], counts[world, kind, False]
                 print(f"{world:8s} {kind:9s} {rest:4d} for development, {locked:4d} locked")
         return
+    if args.save is not None:
+        save_all([c for c in chosen if locked_by_rule(c) == args.locked], args.save)
+        return
     print(f"{'data set':52s} {'make':>6s} {'nominal':>8s} {'truth':>6s}  nominal, by channel")
     for case in chosen:
         if locked_by_rule(case):
@@ -65,6 +76,14 @@ def main(args: Args) -> None:
         best = "-" if truth is None else f"{max(truth.values()):.2f}"
         listed = ", ".join(f"{name} {value:.1f}" for name, value in worst[:3])
         print(f"{case.name:52s} {spent:5.1f}s {worst[0][1]:8.2f} {best:>6s}  {listed}", flush=True)
+
+
+def save_all(chosen: Sequence[DataSet], folder: Path) -> None:
+    """Make data sets that a folder lacks and write them there."""
+    missing = [c for c in chosen if not is_kept(c, folder)]
+    for k, case in enumerate(missing):
+        save(case, make(case), folder)
+        print(f"{k + 1:3d}/{len(missing)} {case.name}", flush=True)
 
 
 def _wanted(case: DataSet, args: Args) -> bool:

@@ -22,6 +22,7 @@ import tyro
 from joblib.externals.loky import get_reusable_executor
 
 from benchmarks.independent.data_set import Data, DataSet
+from benchmarks.independent.kept_data import is_kept, load
 from benchmarks.independent.split import locked_names
 from benchmarks.independent.worlds import all_sets, make
 from concent_warp.comparison.compare import CompareCfg, compare
@@ -61,12 +62,14 @@ class Args:
     """Limit of the diagnosis' duration [s]."""
     cores: int = CORES
     """Processes of the diagnosis."""
+    recordings: Path | None = None
+    """Folder of data sets that were made elsewhere; what it lacks is made here."""
 
 
 def main(args: Args) -> None:
     """Diagnose one data set and keep the result."""
     (case,) = [c for c in all_sets() if c.name == args.name]
-    result = study(case, args.limit, args.cores) | {"commit": args.commit}
+    result = study(case, args.limit, args.cores, args.recordings) | {"commit": args.commit}
     write_text(path(args.out, case.name), json.dumps(result, allow_nan=False) + "\n")
 
 
@@ -84,10 +87,10 @@ def described(case: DataSet) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def study(case: DataSet, limit: float = SECONDS, cores: int = CORES) -> dict[str, Any]:
+def study(case: DataSet, limit: float = SECONDS, cores: int = CORES, recordings: Path | None = None) -> dict[str, Any]:
     """Return the result of the diagnosis of a data set, in plain types."""
     result = described(case)
-    data = make(case)
+    data = load(case, recordings) if recordings is not None and is_kept(case, recordings) else make(case)
     result["truth"] = [
         {"name": t.effect, "parameters": dict(t.parameters), "target": list(t.target), "known": t.known}
         for t in data.truth

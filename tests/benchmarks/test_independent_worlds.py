@@ -81,6 +81,39 @@ def test_recordings_are_valid_repeat_themselves_and_state_noise_as_they_should(w
     assert not np.array_equal(data.recording[0].qpos, data.held_out[0].qpos)
 
 
+def test_recordings_made_elsewhere_are_those_made_here(worlds, script, tmp_path):
+    kept, program = script("benchmarks.independent.kept_data"), script("benchmarks.independent.data_sets")
+    cases = [replace(named(worlds, name), noise_stated=False) for name in ("drop-null-0", "drop-air_drag-large")]
+    program.save_all(cases, tmp_path)
+    for case in cases:
+        assert kept.is_kept(case, tmp_path)
+        there, here = kept.load(case, tmp_path), worlds.make(case)
+        assert there.truth == here.truth
+        assert there.scene.xml == here.scene.xml
+        for a, b in ((there.recording, here.recording), (there.held_out, here.held_out)):
+            assert len(a.demonstrations) == len(b.demonstrations)
+            for first, second in zip(a.demonstrations, b.demonstrations, strict=True):
+                assert first.measured.keys() == second.measured.keys()
+                for name, channel in first.measured.items():
+                    other = second.measured[name]
+                    assert np.array_equal(channel.value, other.value, equal_nan=True)
+                    assert np.array_equal(channel.time, other.time)
+                    assert channel.noise_std == other.noise_std
+    assert not kept.is_kept(cases[0], tmp_path / "other")
+
+
+def test_a_world_that_is_not_installed_is_diagnosed_from_recordings_only(script, worlds, tmp_path, monkeypatch):
+    program, kept = script("benchmarks.independent.__main__"), script("benchmarks.independent.kept_data")
+    case = named(worlds, "drake-launch-null-1")
+    monkeypatch.setattr(program, "find_spec", lambda _: None)
+    ended = {"truth": [], "error": "time-out", "seconds": 1.0}
+    monkeypatch.setattr(program, "in_process", lambda case, *_: (program.described(case) | ended, 1.0))
+    with pytest.raises(SystemExit, match="needs the package drake"):
+        program.run([case], program.Args(out=tmp_path))
+    kept.save(case, worlds.make(replace(named(worlds, "drop-null-0"), noise_stated=False)), tmp_path)
+    program.run([case], program.Args(out=tmp_path, recordings=tmp_path))
+
+
 def test_instruments_quantise_lose_readings_and_are_late(script):
     instruments = script("benchmarks.independent.instruments")
     encoder = instruments.Instrument(200.0, 0.0, step=0.01, latency=0.02, lost=0.1, occlusions=1.0)
