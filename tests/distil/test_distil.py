@@ -1,7 +1,9 @@
 """The whole chain at a tiny size: teacher, DAgger with images, checkpoint, trials, export, commands."""
 
 import json
+import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -15,6 +17,7 @@ from concent_warp.deploy.simulated_images import simulated_images
 from concent_warp.errors import ConcentError, TrainError
 from concent_warp.train.distil.dagger import Dagger
 from concent_warp.train.distil.run import Distillation
+from concent_warp.train.distil.samples import Samples
 from concent_warp.train.learning.metrics import read_curve
 from tests.distil.conftest import TINY
 
@@ -90,6 +93,20 @@ def test_a_distillation_that_stopped_continues_exactly(teacher, student, tmp_pat
     assert same(whole, student)
     assert not list(out.glob("samples_*"))
     assert [point["iteration"] for point in read_curve(out)] == [1, 2, 3]
+
+
+def test_checkpoints_that_take_long_are_written_less_often(teacher, tmp_path, monkeypatch):
+    written, save = [], Samples.save
+
+    def slow(samples: Samples, path: Path) -> None:
+        save(samples, path)
+        time.sleep(0.5)
+        written.append(path.name)
+
+    monkeypatch.setattr(Samples, "save", slow)
+    often = replace(TINY, checkpoint=1e-3, dagger=replace(TINY.dagger, iterations=4, updates=1))
+    cw.distil(teacher, often, device="cpu", out=tmp_path / "student")
+    assert len(written) == 1
 
 
 def test_a_distillation_begins_with_another_student_and_keeps_its_statistics(teacher, student):

@@ -230,7 +230,8 @@ class DistilCfg:
     seed: int = 0
     """Seed of all random numbers."""
     checkpoint: Positive = 600.0
-    """Time between checkpoints [s]; one is also written at the end and on interruption."""
+    """Time between checkpoints [s]; one is also written at the end and on interruption. Where writing one takes longer
+    than a tenth of this time, as tens of gigabytes of samples may, the time is ten times as long as that."""
     states: Count | None = None
     """Initial states of the episodes; as many as in the teacher's training by default."""
     free: Share = 0.5
@@ -240,10 +241,10 @@ class DistilCfg:
     """In chains of stages, least distance of contact pairs at which a stage ends [m], as `ChainCfg.tolerance`: a
     student does not observe the stage, and a teacher that waits for a grasp as exact as its own gives the same images
     two labels."""
-    physics: Literal["training", "stress"] = "training"
+    physics: Literal["training", "stress"] = "stress"
     """Physics in which the student learns: the teacher's training's, or that of its stress test, in which edges catch
     and steps are shorter (`StressCfg.refine`). In the former a block that is some millimetres beside its hole slides
-    in."""
+    in, and its students stop at the rim in Reality."""
     dagger: DaggerCfg = field(default_factory=DaggerCfg)
     """The training."""
     images: ImagesCfg = field(default_factory=ImagesCfg)

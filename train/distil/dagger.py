@@ -39,6 +39,8 @@ HUBER = 0.2
 """Difference of an action from its label above which the loss is linear [-]."""
 SETTLED = 1e9
 """Number of samples that mean and standard deviation of another student's proprioception count as."""
+SAVING_RATIO = 10.0
+"""Least time between checkpoints over that of writing one [-]."""
 POSE_HUBER = 0.1
 """The same of a scaled pose: 5 mm."""
 
@@ -102,7 +104,7 @@ class Dagger:
         self._taught = torch.zeros(n, dtype=torch.bool, device=self.device)
         self._outcomes = torch.zeros(4, dtype=torch.float64, device=self.device)
         self._recent: list[list[float]] = []
-        self._warned, self._saved = False, 0.0
+        self._warned, self._saved, self._saving = False, 0.0, 0.0
 
     @property
     def beta(self) -> float:
@@ -136,7 +138,8 @@ class Dagger:
                         raise KeyboardInterrupt
                     now = time.monotonic()
                     late, due = self._decisions_of_rank_zero(
-                        seconds is not None and now - begun > seconds, now - self._saved > self.cfg.checkpoint
+                        seconds is not None and now - begun > seconds,
+                        now - self._saved > max(self.cfg.checkpoint, SAVING_RATIO * self._saving),
                     )
                     if late:
                         break
@@ -336,7 +339,7 @@ class Dagger:
         """
         if self.folder is None:
             return
-        self._saved = time.monotonic()
+        begun = time.monotonic()
         ended = self.iteration >= self.cfg.dagger.iterations
         worlds = {name: value.cpu() for name, value in self.environment.state().items()}
         looks = {name: value.cpu() for name, value in self._images.source.state().items()}
@@ -356,6 +359,8 @@ class Dagger:
         for path in self.folder.glob(f"samples_{self.process.rank}_*.bin"):
             if ended or path != self._samples_file(self.iteration):
                 path.unlink()
+        self._saved = time.monotonic()
+        self._saving = self._saved - begun
 
     def _samples_file(self, iteration: int) -> Path:
         """Return the file of this rank's samples at an iteration."""
