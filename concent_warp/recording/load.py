@@ -12,6 +12,7 @@ from concent_warp.recording.formats.hdf5 import read_hdf5
 from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.unwind import unwound
 
 KINDS = (
     "an HDF5 file (.h5, .hdf5), a folder of CSV files with a scene.xml, a .pt toss or a folder of tosses, a .json log "
@@ -27,6 +28,7 @@ def load_recording(path: Path | str) -> Recording:
 
     An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``, a BAM log by ``.json``; a folder by
     what is in it: ``.pt`` files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders, or else ``.json`` files.
+    Angles of joints that begin anew after each turn are continued over the jumps, with a warning.
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
@@ -37,7 +39,11 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    path = Path(path)
+    return unwound(_read(Path(path)))
+
+
+def _read(path: Path) -> Recording:
+    """Read a recording as it is stored."""
     if (kind := log_kind(path)) is not None and not (path / "scene.xml").exists():
         options = "" if kind == "bop" else " --model robot.xml --map robot.toml"
         fix = f"read it with `concent import {path}{options} -o demo.h5`"

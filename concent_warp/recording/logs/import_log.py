@@ -23,6 +23,7 @@ from concent_warp.recording.logs.readers.log import Log
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.unwind import unwound
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
@@ -75,6 +76,7 @@ def import_log(
     else:
         recording = _mapped(sources, model, mapping, cfg, progress)
     validate(recording)
+    recording = unwound(recording)
     if out is not None:
         write_hdf5(recording, out)
     if progress is not None:
