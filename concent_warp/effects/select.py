@@ -115,6 +115,11 @@ def outermost_links(m: mujoco.MjModel) -> list[int]:
     return sorted(jointed - above)
 
 
+def moving_as_one(m: mujoco.MjModel, body: int) -> list[int]:
+    """Return a body and those that are fixed to it, such as the tool or the payload on a link."""
+    return [body, *(b for b in range(body + 1, m.nbody) if m.body_weldid[b] == m.body_weldid[body])]
+
+
 def geoms_of(m: mujoco.MjModel, body: int) -> np.ndarray:
     """Return the geoms that move as one with a body, shape (n,) int."""
     return np.flatnonzero(m.body_weldid[m.geom_bodyid] == m.body_weldid[body])
