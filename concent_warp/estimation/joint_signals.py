@@ -90,6 +90,14 @@ def joint_signals(m: mujoco.MjModel, demonstration: Demonstration, smoother: Smo
     return tuple(found)
 
 
+def joint_rates(m: mujoco.MjModel, demonstration: Demonstration, smoother: LocalPolynomialCfg) -> dict[int, Signal]:
+    """Return the velocities of the hinges and slides of which a sensor measured the velocity alone, by their joints."""
+    positions = _channels(m, demonstration, SENSOR.mjSENS_JOINTPOS)
+    rates = _channels(m, demonstration, SENSOR.mjSENS_JOINTVEL)
+    smoothed = {joint: smoother.readings(rate, "joint") for joint, rate in rates.items() if joint not in positions}
+    return {joint: readings for joint, readings in smoothed.items() if readings is not None}
+
+
 def coupled_joints(
     m: mujoco.MjModel,
     demonstration: Demonstration,

@@ -12,6 +12,7 @@ from concent_warp.recording.formats.hdf5 import read_hdf5
 from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.unwind import unwound
 
 KINDS = (
@@ -28,7 +29,8 @@ def load_recording(path: Path | str) -> Recording:
 
     An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``, a BAM log by ``.json``; a folder by
     what is in it: ``.pt`` files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders, or else ``.json`` files.
-    Angles of joints that begin anew after each turn are continued over the jumps, with a warning.
+    Angles of joints that begin anew after each turn are continued over the jumps, and times of a log that begins later
+    than its clock are counted from its first sample, each with a warning.
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
@@ -39,7 +41,7 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    return unwound(_read(Path(path)))
+    return unwound(counted_from_first_sample(_read(Path(path))))
 
 
 def _read(path: Path) -> Recording:
