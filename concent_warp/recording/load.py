@@ -12,6 +12,7 @@ from concent_warp.recording.formats.hdf5 import read_hdf5
 from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.still_bodies import warn_of_still_bodies
 from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.unwind import unwound
 
@@ -41,7 +42,9 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    return unwound(counted_from_first_sample(_read(Path(path))))
+    recording = unwound(counted_from_first_sample(_read(Path(path))))
+    warn_of_still_bodies(recording)
+    return recording
 
 
 def _read(path: Path) -> Recording:
