@@ -1,7 +1,7 @@
 """States of actuators at the start of a simulation: those in which the first command would have left them.
 
-A recording says nothing of them, and begins anywhere in a motion: the filter of a servo that starts empty would pull the
-joint to zero first (MuJoCo documentation, chapter Computation, actuator activation dynamics).
+A recording says nothing of them, and begins anywhere in a motion: the filter of a servo that starts empty would pull
+the joint to zero first (MuJoCo documentation, chapter Computation, actuator activation dynamics).
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ class WarpEngine:
         return self._join(run, parts)
 
     def _activations(self, count: int, qpos: Any, ctrl: Any) -> np.ndarray:
-        """Return the activations of some variants at the start, shape (count, na), from their positions and commands."""
+        """Return the activations of variants at the start, shape (count, na), from positions and commands."""
         host = [value.detach().cpu().numpy() if hasattr(value, "detach") else value for value in (qpos, ctrl)]
         place = np.tile(self._compiled.qpos0, (count, 1)) if host[0] is None else np.asarray(host[0])
         return initial_activations(self._compiled, place, np.asarray(host[1]))

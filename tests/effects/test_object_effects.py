@@ -77,7 +77,8 @@ def test_size_scales_shapes_and_places_and_leaves_mass_and_inertia(xml):
 
 TOOL = """<mujoco><worldbody><body name="link"><joint name="hinge" axis="0 1 0"/><geom size="0.05" mass="1"/>
 <body name="frame"><body name="tool" pos="0 0 -0.1"><geom size="0.03" mass="0.5"/><site name="wrist"/></body></body>
-</body><body name="object" pos="1 0 0"><freejoint/><geom size="0.02"/><body name="marker"><geom size="0.01"/></body></body>
+</body><body name="object" pos="1 0 0"><freejoint/><geom size="0.02"/>
+<body name="marker"><geom size="0.01"/></body></body>
 </worldbody><sensor><force name="load" site="wrist"/></sensor></mujoco>"""
 
 

@@ -12,7 +12,8 @@ from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 
 FOUR_BAR = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
-<body name="crank"><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.01" contype="0"/>
+<body name="crank"><joint name="crank" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.01" contype="0"/>
 <body name="coupler" pos="0 0 0.1"><joint name="coupler" axis="0 1 0"/>
 <geom type="capsule" fromto="0 0 0 0.25 0 0.05" size="0.01" contype="0"/></body></body>
 <body name="rocker" pos="0.25 0 0"><joint name="rocker" axis="0 1 0"/>
@@ -35,7 +36,10 @@ def gap(m, qpos):
     d = mujoco.MjData(m)
     d.qpos[:] = qpos
     mujoco.mj_kinematics(m, d)
-    ends = [d.body(n).xpos + d.body(n).xmat.reshape(3, 3) @ at for n, at in (("coupler", (0.25, 0, 0.05)), ("rocker", (0, 0, 0.15)))]
+    ends = [
+        d.body(n).xpos + d.body(n).xmat.reshape(3, 3) @ at
+        for n, at in (("coupler", (0.25, 0, 0.05)), ("rocker", (0, 0, 0.15)))
+    ]
     return float(np.linalg.norm(ends[0] - ends[1]))
 
 

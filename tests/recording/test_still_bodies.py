@@ -11,7 +11,8 @@ from concent_warp.recording.still_bodies import warn_of_still_bodies
 SCENE = """<mujoco><worldbody><body name="target" mocap="true"><geom size="0.1"/></body>
 <body name="block" pos="1 0 0"><geom size="0.1"/><site name="marker"/></body>
 <body name="free" pos="2 0 0"><freejoint/><geom size="0.1"/></body></worldbody>
-<sensor><framepos name="target" objtype="body" objname="target"/><framepos name="marker" objtype="site" objname="marker"/>
+<sensor><framepos name="target" objtype="body" objname="target"/>
+<framepos name="marker" objtype="site" objname="marker"/>
 <framepos name="free" objtype="body" objname="free"/></sensor></mujoco>"""
 TIME = np.arange(0, 2, 0.01)
 

@@ -6,7 +6,8 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 
-SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody>
+SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/></body>
+</worldbody>
 <actuator><motor name="drive" joint="hinge"/></actuator><sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
 
 

@@ -12,7 +12,8 @@ from concent_warp.recording.logs.targets import Target
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.unwind import unwound
 
-SCENE = """<mujoco><worldbody><body><joint name="wheel" axis="0 0 1" {range}/><geom size="0.1" mass="1"/></body></worldbody>
+SCENE = """<mujoco><worldbody><body><joint name="wheel" axis="0 0 1" {range}/><geom size="0.1" mass="1"/></body>
+</worldbody>
 <actuator><position name="servo" joint="wheel" kp="5"/></actuator>
 <sensor><jointpos name="encoder" joint="wheel"/></sensor></mujoco>"""
 TIME = np.arange(0, 6, 0.01)
@@ -25,7 +26,9 @@ def wrapped(angle):
 
 def turning(value, *, time=TIME, command=None, limits="", qpos=None):
     action = {} if command is None else {"servo": Channel(time, command)}
-    demonstration = Demonstration("demo_0", action=action, measured={"encoder": Channel(time, value[:, None])}, qpos=qpos)
+    demonstration = Demonstration(
+        "demo_0", action=action, measured={"encoder": Channel(time, value[:, None])}, qpos=qpos
+    )
     return Recording(SCENE.format(range=limits), (demonstration,))
 
 

@@ -12,8 +12,8 @@ from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.warp_engine import WarpEngine
 
 SCENE = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/><worldbody>
-<body><joint name="one" axis="0 0 1" damping="1"/><geom size="0.1" mass="1" contype="0" conaffinity="0"/></body>
-<body pos="1 0 0"><joint name="two" axis="0 0 1" damping="1"/><geom size="0.1" mass="1" contype="0" conaffinity="0"/></body>
+<body><joint name="one" axis="0 0 1" damping="1"/><geom size="0.1" mass="1"/></body>
+<body pos="1 0 0"><joint name="two" axis="0 0 1" damping="1"/><geom size="0.1" mass="1"/></body>
 </worldbody><actuator>
 <position name="filtered" joint="one" kp="20" timeconst="0.3"/>
 <intvelocity name="moved" joint="two" kp="20" gear="2"/>
@@ -32,8 +32,12 @@ def test_a_servo_with_a_filter_or_an_integrator_holds_the_pose_that_it_begins_in
 
 
 def test_activations_keep_within_their_ranges_and_others_are_zero():
-    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j" range="-2 2"/><geom size="0.1"/></body>
-    </worldbody><actuator><general joint="j" dyntype="filter" dynprm="0.1" ctrlrange="-1 1" ctrllimited="true"/>
+    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+    <body><joint name="j" range="-2 2"/><geom size="0.1"/></body></worldbody><actuator>
+    <general joint="j" dyntype="filter" dynprm="0.1" ctrlrange="-1 1" ctrllimited="true"/>
     <muscle joint="j"/><general joint="j" dyntype="integrator"/>
-    <general joint="j" dyntype="filterexact" dynprm="0.1" actrange="-0.2 0.2" actlimited="true"/></actuator></mujoco>""")
-    np.testing.assert_allclose(initial_activation(m, mujoco.MjData(m), np.array([3.0, 0.4, 5.0, 0.7])), [1, 0.4, 0, 0.2])
+    <general joint="j" dyntype="filterexact" dynprm="0.1" actrange="-0.2 0.2" actlimited="true"/>
+    </actuator></mujoco>""")
+    np.testing.assert_allclose(
+        initial_activation(m, mujoco.MjData(m), np.array([3.0, 0.4, 5.0, 0.7])), [1, 0.4, 0, 0.2]
+    )
