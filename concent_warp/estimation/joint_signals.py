@@ -186,8 +186,10 @@ def _closed_by_loops(
     qpos = np.tile(m.qpos0 if demonstration.qpos is None else demonstration.qpos, (len(time), 1))
     qpos[:, known.qpos[~loose]] = known.estimate(time).value[:, ~loose]
     closed = close_loops(m, qpos, known.dof[loose])
+    if closed is None:
+        return {}
     found: dict[int, Signal] = {}
-    for k in np.flatnonzero(loose) if closed is not None else ():
+    for k in np.flatnonzero(loose):
         signal = smoother.signal(Channel(time, closed[:, [known.qpos[k]]]), None, "joint")
         if signal is not None:
             found[int(k)] = signal

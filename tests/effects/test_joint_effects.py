@@ -128,7 +128,7 @@ def test_bearings_of_ball_joints_brake_about_every_axis(effect, value, left):
     assert ("socket",) not in JointOffset.targets(m)
     model = world(SOCKET.replace('damping="0.001"', ""), effect("hinge", "socket"), 0.0, value)
     for axis in range(3):
-        qvel = np.zeros(4)
+        qvel = [0.0] * 4
         qvel[axis] = 3.0
         moved = move(model, 0.5, qvel=qvel)
         assert moved.qvel[-1, axis] == pytest.approx(left, rel=2e-3)

@@ -8,7 +8,8 @@ from concent_warp.recording.load import load_recording
 
 SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/></body>
 </worldbody>
-<actuator><motor name="drive" joint="hinge"/></actuator><sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
+<actuator><motor name="drive" joint="hinge"/></actuator>
+<sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
 
 
 def write(folder, start, unit=1.0):
