@@ -22,7 +22,7 @@ KINDS = (
 )
 
 LOGS = {"lerobot": "a LeRobot data set", "ros": "a ROS bag or MCAP file", "images": "a folder of images",
-        "bop": "a BOP data set"}  # fmt: skip
+        "table": "a table", "bop": "a BOP data set"}  # fmt: skip
 
 
 def load_recording(path: Path | str) -> Recording:

@@ -44,8 +44,8 @@ def import_log(
     """Read logs of another system as a recording.
 
     Args:
-        source: LeRobot v3 data set, MCAP file, ROS bag, or folder of colour and depth images; several of them, or a
-            folder of them; or one scene of a BOP data set, which needs neither model nor mapping.
+        source: LeRobot v3 data set, MCAP file, ROS bag, table (.csv), or folder of colour and depth images; several of
+            them, or a folder of them; or one scene of a BOP data set, which needs neither model nor mapping.
         model: Scene, or MJCF file of it, with named actuators and sensors.
         cfg: Settings.
         mapping: Map of names, units and signs, or a TOML file of it.
