@@ -27,6 +27,9 @@ class UnwindCfg:
 
     min_jump: float = 2 / 3
     """Least jump between samples next to one another [turns]: the motion behind it is then at most half as long."""
+    max_step: float = 0.25
+    """Motion between samples that 95 % of the continued angles keep below [turns]: noise that reaches round the circle
+    does not."""
     max_gap: float = 3.0
     """Longest time between such samples, in units of the median: in a longer gap the joint itself may have turned
     [-]."""
@@ -86,9 +89,11 @@ def wraps(time: np.ndarray, value: np.ndarray, turn: float, cfg: UnwindCfg | Non
     cfg, known = cfg or UnwindCfg(), np.isfinite(value)
     if known.sum() < 2 or np.ptp(value[known]) > (1 + cfg.tolerance) * turn:
         return False
-    steps = np.diff(time[known])
-    jumps = np.abs(np.diff(value[known])) > cfg.min_jump * turn
-    return bool((jumps & (steps <= cfg.max_gap * np.median(steps))).any())
+    periods, steps = np.diff(time[known]), np.diff(value[known])
+    near = periods <= cfg.max_gap * np.median(periods)
+    moved = np.abs(steps - turn * np.round(steps / turn))[near]
+    jumps = np.abs(steps)[near] > cfg.min_jump * turn
+    return bool(jumps.any() and np.quantile(moved, 0.95) < cfg.max_step * turn)
 
 
 def continued(value: np.ndarray) -> np.ndarray:

@@ -53,6 +53,7 @@ def test_angles_begin_at_the_turn_that_the_initial_state_states():
     ("value", "time", "limits"),
     [
         (ANGLE, TIME, ""),  # not wrapped
+        (np.clip(np.random.default_rng(2).normal(0, 1, len(TIME)), -3, 3), TIME, ""),  # noise
         (np.where(TIME < 3, -2.5, 2.5), np.where(TIME < 3, TIME, TIME + 5), ""),  # it turned while nothing was read
         (np.where(TIME < 3, -2.5, 2.5), TIME, 'range="-3 3" limited="true"'),  # no way round
     ],
