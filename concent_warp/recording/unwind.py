@@ -9,6 +9,7 @@ next to one another, which the continued angle makes less than half as long.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -47,7 +48,10 @@ def unwound(recording: Recording, cfg: UnwindCfg | None = None) -> Recording:
         recording: The recording, valid.
         cfg: Thresholds.
     """
-    cfg, m = cfg or UnwindCfg(), Scene(recording.scene, recording.source).model
+    cfg = cfg or UnwindCfg()
+    if not any(wraps(time, value, TURN, cfg) for d in recording.demonstrations for time, value in _numbers(d)):
+        return recording  # without compiling the scene
+    m = Scene(recording.scene, recording.source).model
     named: dict[str, None] = {}
     demonstrations = []
     for d in recording.demonstrations:
@@ -101,6 +105,15 @@ def continued(value: np.ndarray) -> np.ndarray:
     value, known = np.array(value, dtype=float), np.isfinite(value)
     value[known] = np.unwrap(value[known])
     return value
+
+
+def _numbers(d: Demonstration) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield times and values of all commands, and of all measurements of one component."""
+    for channel in d.action.values():
+        yield channel.time, np.asarray(channel.value, dtype=float)
+    for channel in d.measured.values():
+        if channel.value.shape[1] == 1:
+            yield channel.time, np.asarray(channel.value[:, 0], dtype=float)
 
 
 def _unwound(time: np.ndarray, value: np.ndarray, cfg: UnwindCfg) -> np.ndarray | None:
