@@ -143,6 +143,10 @@ class SearchCfg:
     parallel_rivals: Share = 0.95
     """Cosine between what two rivals take from the residuals, from which on the search is continued from the stronger
     alone [-]: less than a tenth of what either takes, in squares, is then its own."""
+    dependent_share: Share = 0.1
+    """Variance that the data leave of a combination of an effect's parameters, over that of the same combination if
+    they were independent, below which the combination's own interval may exclude its null value [-]: of two parameters
+    it is one less their correlation. As the friction of two fingers that are coupled, they stand in for one another."""
     min_fold_share: Share = 0.8
     """Share of the folds' gains and losses that an accepted effect must gain [-]: 4 of 5. A fold whose motions hardly
     show the effect loses or gains little."""

@@ -10,13 +10,16 @@ import numpy as np
 from concent_warp.diagnosis.cfg import CheckDataCfg
 from concent_warp.estimation.noise import Noise
 from concent_warp.estimation.partial_state import partial_state
+from concent_warp.estimation.rotations import continuous_quaternions
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.recording.recording import Recording
+from concent_warp.scene.scene import Scene
 
 
 def check_data(recording: Recording, cfg: CheckDataCfg | None = None) -> list[str]:
     """Return a sentence on each gap, missing samples, constant reading or mere noise in a recording's channels."""
-    cfg, found = cfg or CheckDataCfg(), []
+    cfg, m, found = cfg or CheckDataCfg(), Scene(recording.scene, recording.source).model, []
+    orientations = {m.sensor(i).name for i in range(m.nsensor) if kind_and_unit(m, i)[0] == "orientation"}
     for d in recording.demonstrations:
         alone = len(d.measured) == 1
         for name, channel in d.measured.items():
@@ -36,6 +39,8 @@ def check_data(recording: Recording, cfg: CheckDataCfg | None = None) -> list[st
             if (share := 1 - known.mean()) > cfg.max_missing_share:
                 found.append(f"{where}: {100 * share:.0f} % of the samples are missing.")
             values = value[known]
+            if name in orientations:  # either sign is the same orientation
+                values = continuous_quaternions(values)
             if len(values) > 10 and np.ptp(values, axis=0).max() == 0.0:
                 found.append(f"{where}: the reading never changes.")
             stated = channel.noise_std

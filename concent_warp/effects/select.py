@@ -12,6 +12,7 @@ from concent_warp.scene.sensor_frame import sensor_frame
 JOINT = mujoco.mjtJoint
 SENSOR = mujoco.mjtSensor
 SINGLE = (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_SLIDE))
+BEARINGS = (*SINGLE, int(JOINT.mjJNT_BALL))
 POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
 
@@ -21,12 +22,14 @@ def element_name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:
     return mujoco.mj_id2name(m, kind, int(i)) or ""
 
 
-def joints_by_type(m: mujoco.MjModel, among: Iterable[int] | None = None) -> tuple[tuple[str, ...], ...]:
-    """Return the names of hinges, then of slides; a selection without members is left out."""
+def joints_by_type(
+    m: mujoco.MjModel, among: Iterable[int] | None = None, kinds: tuple[int, ...] = SINGLE
+) -> tuple[tuple[str, ...], ...]:
+    """Return the names of hinges, then of slides, or of other kinds; a selection without members is left out."""
     ids = range(m.njnt) if among is None else sorted(among)
     groups = [
         tuple(n for j in ids if int(m.jnt_type[j]) == kind and (n := element_name(m, mujoco.mjtObj.mjOBJ_JOINT, j)))
-        for kind in SINGLE
+        for kind in kinds
     ]
     return tuple(group for group in groups if group)
 
@@ -115,6 +118,11 @@ def outermost_links(m: mujoco.MjModel) -> list[int]:
     return sorted(jointed - above)
 
 
+def moving_as_one(m: mujoco.MjModel, body: int) -> list[int]:
+    """Return a body and those that are fixed to it, such as the tool or the payload on a link."""
+    return [body, *(b for b in range(body + 1, m.nbody) if m.body_weldid[b] == m.body_weldid[body])]
+
+
 def geoms_of(m: mujoco.MjModel, body: int) -> np.ndarray:
     """Return the geoms that move as one with a body, shape (n,) int."""
     return np.flatnonzero(m.body_weldid[m.geom_bodyid] == m.body_weldid[body])
@@ -145,9 +153,26 @@ def dof_of(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
     return m.jnt_dofadr[joints]
 
 
+def dofs_of(m: mujoco.MjModel, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the degrees of freedom of hinges, slides and ball joints, shape (k,), and for each the row of its joint.
+
+    A ball joint has three.
+    """
+    count = np.where(m.jnt_type[joints] == int(JOINT.mjJNT_BALL), 3, 1)
+    rows = np.repeat(np.arange(len(joints)), count)
+    within = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+    return m.jnt_dofadr[joints][rows] + within, rows
+
+
 def typical_torque(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
-    """Return the torque [N m] or force [N] that moves each joint at 10 rad/s^2 or m/s^2, shape (n,)."""
-    return 10.0 * m.dof_M0[dof_of(m, joints)]
+    """Return the torque [N m] or force [N] that moves each joint at 10 rad/s^2 or m/s^2, shape (n,).
+
+    Of a ball joint it is that about the axis of the largest inertia.
+    """
+    dofs, rows = dofs_of(m, joints)
+    inertia = np.zeros(len(joints))
+    np.maximum.at(inertia, rows, m.dof_M0[dofs])
+    return 10.0 * inertia
 
 
 def shown_dofs(m: mujoco.MjModel, sensors: Iterable[str]) -> np.ndarray:

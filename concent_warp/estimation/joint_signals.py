@@ -1,4 +1,4 @@
-"""Measured motion of hinges and slides: by their own sensors, and by the tendons and equalities that couple them."""
+"""Measured motion of hinges and slides: by their own sensors, and by tendons, equalities and loops that couple them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.closed_loops import close_loops
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sample_values_and_rates
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
+from concent_warp.recording.recording import Channel
 
 if TYPE_CHECKING:
-    from concent_warp.recording.recording import Channel, Demonstration
+    from concent_warp.recording.recording import Demonstration
 
 SENSOR = mujoco.mjtSensor
 HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -90,6 +92,14 @@ def joint_signals(m: mujoco.MjModel, demonstration: Demonstration, smoother: Smo
     return tuple(found)
 
 
+def joint_rates(m: mujoco.MjModel, demonstration: Demonstration, smoother: LocalPolynomialCfg) -> dict[int, Signal]:
+    """Return the velocities of the hinges and slides of which a sensor measured the velocity alone, by their joints."""
+    positions = _channels(m, demonstration, SENSOR.mjSENS_JOINTPOS)
+    rates = _channels(m, demonstration, SENSOR.mjSENS_JOINTVEL)
+    smoothed = {joint: smoother.readings(rate, "joint") for joint, rate in rates.items() if joint not in positions}
+    return {joint: readings for joint, readings in smoothed.items() if readings is not None}
+
+
 def coupled_joints(
     m: mujoco.MjModel,
     demonstration: Demonstration,
@@ -125,18 +135,65 @@ def coupled_joints(
             equations.append(coefficients)
             readings.append(signal)
     couplings = _equalities(m, column)
-    equations += [coefficients for coefficients, _ in couplings]
-    rows = np.array(equations) if equations else np.zeros((0, len(joints)))
-    if len(joints) and (len(rows) < len(joints) or np.linalg.svd(rows, compute_uv=False)[-1] < min_singular):
-        loose = np.abs(np.eye(len(joints)) - np.linalg.pinv(rows) @ rows).max(axis=1) > min_singular
+    constants = np.array([constant for _, constant in couplings])
+
+    def joined() -> CoupledJoints:
+        rows = [*equations, *(coefficients for coefficients, _ in couplings)]
+        matrix = np.array(rows) if rows else np.zeros((0, len(joints)))
+        return CoupledJoints(m.jnt_qposadr[joints], m.jnt_dofadr[joints], matrix, tuple(readings), constants)
+
+    found = joined()
+    loose = _loose(found.coefficients, min_singular)
+    if loose.any() and readings:
+        for k, signal in _closed_by_loops(m, demonstration, smoother, found, loose).items():
+            equations.append(np.eye(len(joints))[k])
+            readings.append(signal)
+        found = joined()
+        loose = _loose(found.coefficients, min_singular)
+    if loose.any():
         raise RecordingError(
             "a window cannot start where joints were not measured",
             where=demonstration.name,
             expected=f"readings of {[m.joint(int(j)).name for j in joints[loose]]}",
             fix="record joint position sensors, or fit whole demonstrations",
         )
-    constants = np.array([constant for _, constant in couplings])
-    return CoupledJoints(m.jnt_qposadr[joints], m.jnt_dofadr[joints], rows, tuple(readings), constants)
+    return found
+
+
+def _loose(rows: np.ndarray, min_singular: float) -> np.ndarray:
+    """Return which of J joints linear equations, shape (E, J), do not determine, shape (J,) bool."""
+    count = rows.shape[1]
+    if not count or (len(rows) >= count and np.linalg.svd(rows, compute_uv=False)[-1] >= min_singular):
+        return np.zeros(count, dtype=bool)
+    return np.abs(np.eye(count) - np.linalg.pinv(rows) @ rows).max(axis=1) > min_singular
+
+
+def _closed_by_loops(
+    m: mujoco.MjModel, demonstration: Demonstration, smoother: SmootherCfg, known: CoupledJoints, loose: np.ndarray
+) -> dict[int, Signal]:
+    """Return the positions of joints that closed loops determine, by their index among those of the equations.
+
+    Args:
+        m: The compiled scene.
+        demonstration: What was measured.
+        smoother: How positions are smoothed.
+        known: All joints, of which some are determined.
+        loose: Those that are not, shape (J,) bool.
+    """
+    if not (m.eq_type < int(mujoco.mjtEq.mjEQ_JOINT)).any():  # neither connect nor weld
+        return {}
+    time = max((signal.time for signal in known.readings), key=len)
+    qpos = np.tile(m.qpos0 if demonstration.qpos is None else demonstration.qpos, (len(time), 1))
+    qpos[:, known.qpos[~loose]] = known.estimate(time).value[:, ~loose]
+    closed = close_loops(m, qpos, known.dof[loose])
+    if closed is None:
+        return {}
+    found: dict[int, Signal] = {}
+    for k in np.flatnonzero(loose):
+        signal = smoother.signal(Channel(time, closed[:, [known.qpos[k]]]), None, "joint")
+        if signal is not None:
+            found[int(k)] = signal
+    return found
 
 
 def _signals(

@@ -1,7 +1,8 @@
 """The state of a scene at one time where only a part of it was measured.
 
 Joints and free bodies are estimated from their own readings by local polynomials, positions of a body component by
-component; what was not measured stands as the recording's initial state or the model's reference pose has it, at rest.
+component, and of joints of which the velocity alone was read, that; what was not measured stands as the recording's
+initial state or the model's reference pose has it, at rest.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.estimation.joint_signals import joint_signals
+from concent_warp.estimation.joint_signals import joint_rates, joint_signals
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.recording.recording import Channel
@@ -31,7 +32,7 @@ class PartialState:
     qvel: np.ndarray
     """Shape (nv,) [m/s, rad/s]; 0 where it was not measured."""
     measured: np.ndarray
-    """Which degrees of freedom were measured, shape (nv,) bool."""
+    """Of which degrees of freedom positions were measured, shape (nv,) bool."""
 
 
 def partial_state(
@@ -52,6 +53,9 @@ def partial_state(
         found = joint.position.estimate(at)
         qpos[joint.qpos], qvel[joint.dof] = found.value[0, 0], found.rate[0, 0]
         measured[joint.dof] = True
+    if demonstration.qvel is None or time > 0.0:
+        for joint, rate in joint_rates(m, demonstration, cfg).items():
+            qvel[m.jnt_dofadr[joint]] = rate.estimate(at).value[0, 0]
     for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
         body = m.body(int(m.jnt_bodyid[joint])).name
         place, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])

@@ -12,6 +12,9 @@ from concent_warp.recording.formats.hdf5 import read_hdf5
 from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.still_bodies import warn_of_still_bodies
+from concent_warp.recording.time_zero import counted_from_first_sample
+from concent_warp.recording.unwind import unwound
 
 KINDS = (
     "an HDF5 file (.h5, .hdf5), a folder of CSV files with a scene.xml, a .pt toss or a folder of tosses, a .json log "
@@ -19,7 +22,7 @@ KINDS = (
 )
 
 LOGS = {"lerobot": "a LeRobot data set", "ros": "a ROS bag or MCAP file", "images": "a folder of images",
-        "bop": "a BOP data set"}  # fmt: skip
+        "table": "a table", "bop": "a BOP data set"}  # fmt: skip
 
 
 def load_recording(path: Path | str) -> Recording:
@@ -27,6 +30,8 @@ def load_recording(path: Path | str) -> Recording:
 
     An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``, a BAM log by ``.json``; a folder by
     what is in it: ``.pt`` files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders, or else ``.json`` files.
+    Angles of joints that begin anew after each turn are continued over the jumps, and times of a log that begins later
+    than its clock are counted from its first sample, each with a warning.
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
@@ -37,7 +42,13 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    path = Path(path)
+    recording = unwound(counted_from_first_sample(_read(Path(path))))
+    warn_of_still_bodies(recording)
+    return recording
+
+
+def _read(path: Path) -> Recording:
+    """Read a recording as it is stored."""
     if (kind := log_kind(path)) is not None and not (path / "scene.xml").exists():
         options = "" if kind == "bop" else " --model robot.xml --map robot.toml"
         fix = f"read it with `concent import {path}{options} -o demo.h5`"

@@ -15,6 +15,7 @@ import numpy as np
 
 from concent_warp.checks import check_at_least
 from concent_warp.errors import EngineError
+from concent_warp.simulate.activation import initial_activation
 from concent_warp.simulate.compiled_steps import can_step, cannot_fill_arena
 from concent_warp.simulate.contact_log import collect
 from concent_warp.simulate.engine import Contacts, Rollout, Variants
@@ -247,6 +248,9 @@ class MujocoEngine:
             d.qpos[:] = run.variants.qpos[n]
         if run.variants.qvel is not None:
             d.qvel[:] = run.variants.qvel[n]
+        ctrl = run.ctrl[n % len(run.ctrl)]
+        if m.na and run.steps:
+            d.act[:] = initial_activation(m, d, ctrl[0])
         result = VariantResult.empty(m, run)
         step = simulate_steps
         if records_states_only(m, run):
@@ -254,7 +258,7 @@ class MujocoEngine:
             step = step if force_models else simulate_in_one_call
         try:
             with restored(m, [name for force_model, _ in force_models for name in force_model.edits]):
-                result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, force_models)
+                result.diverged = not step(m, d, run, ctrl, result, force_models)
         except mujoco.FatalError as error:
             if "stack" in str(error) or "arena" in str(error):
                 return None

@@ -15,6 +15,7 @@ import warp as wp
 
 from concent_warp.checks import check_at_least, check_device
 from concent_warp.errors import EngineError
+from concent_warp.simulate.activation import initial_activations
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
 from concent_warp.simulate.inputs import SPHERE_FIELDS, SimulationRun, check_run, compile_model, with_force_models
@@ -155,6 +156,12 @@ class WarpEngine:
                 start += size
         return self._join(run, parts)
 
+    def _activations(self, count: int, qpos: Any, ctrl: Any) -> np.ndarray:
+        """Return the activations of variants at the start, shape (count, na), from positions and commands."""
+        host = [value.detach().cpu().numpy() if hasattr(value, "detach") else value for value in (qpos, ctrl)]
+        place = np.tile(self._compiled.qpos0, (count, 1)) if host[0] is None else np.asarray(host[0])
+        return initial_activations(self._compiled, place, np.asarray(host[1]))
+
     def _run_part(self, run: SimulationRun, rows: np.ndarray) -> ProgramResult | None:
         """Simulate the variants `rows`, the last one standing in for those beyond; None if buffers had to grow."""
         assert self._buffers is not None
@@ -167,7 +174,8 @@ class WarpEngine:
         force_models = [_pick(values, rows) for _, values in run.variants.force_models or ()]
         ctrl = run.ctrl[rows[: program.plan.commands] % len(run.ctrl)]
         qpos, qvel = _pick(run.variants.qpos, rows), _pick(run.variants.qvel, rows)
-        program.load(spheres, fields, force_models, qpos, qvel, ctrl, run.record)
+        act = self._activations(len(rows), qpos, ctrl) if self._compiled.na and run.steps else None
+        program.load(spheres, fields, force_models, qpos, qvel, ctrl, run.record, act)
         demand = program.run()
         if (grown := self._grown(self._buffers, demand, program)) is not None:
             self._buffers = grown

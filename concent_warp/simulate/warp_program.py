@@ -151,7 +151,7 @@ class Program:
         plan, m, d = self.plan, self.model, self.data
         n, r, b = plan.worlds, plan.records, len(plan.bodies)
         self._commands = wp.zeros((plan.commands, max(plan.steps, 1), m.nu), dtype=float)
-        self._qpos, self._qvel = wp.clone(d.qpos), wp.zeros_like(d.qvel)
+        self._qpos, self._qvel, self._act = wp.clone(d.qpos), wp.zeros_like(d.qvel), wp.zeros_like(d.act)
         self._clock = wp.zeros(2, dtype=int)
         self._peak = wp.zeros(kernels.PEAKS, dtype=int)
         self._unstable = wp.zeros(n, dtype=int)
@@ -182,6 +182,7 @@ class Program:
         qvel: Any,
         ctrl: Any,
         record: np.ndarray,
+        act: np.ndarray | None = None,
     ) -> None:
         """Set the values of the next run.
 
@@ -193,6 +194,7 @@ class Program:
             qvel: Shape (N, nv) or None for zero.
             ctrl: Shape (n, K, nu).
             record: Steps to record, shape (R,) int.
+            act: Activations at the start, shape (N, na), or None for zero.
         """
         m, tensor = self.model, self._world_model.tensor
         self._world_model.load(spheres, fields)
@@ -206,6 +208,8 @@ class Program:
             self._qvel.zero_()
         else:
             wp.to_torch(self._qvel).copy_(tensor(qvel))
+        if act is not None:
+            wp.to_torch(self._act).copy_(tensor(act))
         if self.plan.steps and m.nu:
             wp.to_torch(self._commands).copy_(tensor(ctrl).reshape(self._commands.shape))
         row_of = np.full(self.plan.steps + 1, -1, dtype=np.int32)
@@ -266,6 +270,7 @@ class Program:
         mjw.reset_data(m, d, self._all)
         wp.copy(d.qpos, self._qpos)
         wp.copy(d.qvel, self._qvel)
+        wp.copy(d.act, self._act)
         self._world_model.place(d)
         if self._force_models:
             d.qfrc_actuator.zero_()

@@ -138,3 +138,13 @@ def test_a_body_of_which_nothing_says_where_it_starts_is_remarked_on():
     assert start_remarks(m, fallen("seen", qpos=m.qpos0, qvel=np.zeros(m.nv))) == []
     track = PointTrack(np.arange(2.0), np.zeros((2, 3, 3)), np.ones((2, 3), dtype=bool))
     assert start_remarks(m, fallen("seen", points={"other": track})) == []
+
+
+def test_orientations_of_either_sign_do_not_scatter():
+    scene = """<mujoco><worldbody><body><joint name="socket" type="ball"/><geom size="0.1"/></body></worldbody>
+    <sensor><ballquat name="turn" joint="socket"/></sensor></mujoco>"""
+    time = np.arange(0, 2, 0.01)
+    angle = 0.4 * np.sin(3 * time)
+    value = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=1)
+    value *= np.random.default_rng(0).choice([-1.0, 1.0], (len(time), 1))
+    assert check_data(Recording(scene, (Demonstration("demo_0", measured={"turn": Channel(time, value)}),))) == []

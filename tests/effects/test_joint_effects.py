@@ -1,3 +1,4 @@
+import mujoco
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -110,3 +111,25 @@ def test_a_rotor_as_heavy_as_its_link_is_typical():
     (inertia,) = Armature("rail").parameters(m)
     assert inertia.typical == pytest.approx(m.dof_M0[0])
     assert inertia.scale < inertia.typical
+
+
+SOCKET = """<mujoco><option gravity="0 0 0" timestep="0.001"/><worldbody><body name="bob">
+<joint name="socket" type="ball" damping="0.001"/><geom size="0.1" mass="2"/></body>
+<body name="other" pos="1 0 0"><joint name="hinge"/><geom size="0.1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "left"),
+    [(JointDamping, 0.004, 3.0 * np.exp(-0.004 * 0.5 / 0.008)), (JointFriction, 0.01, 3.0 - (0.01 * 0.5) / 0.008)],
+)
+def test_bearings_of_ball_joints_brake_about_every_axis(effect, value, left):
+    m = mujoco.MjModel.from_xml_string(SOCKET)
+    assert ("socket",) in effect.targets(m)
+    assert ("socket",) not in JointOffset.targets(m)
+    model = world(SOCKET.replace('damping="0.001"', ""), effect("hinge", "socket"), 0.0, value)
+    for axis in range(3):
+        qvel = [0.0] * 4
+        qvel[axis] = 3.0
+        moved = move(model, 0.5, qvel=qvel)
+        assert moved.qvel[-1, axis] == pytest.approx(left, rel=2e-3)
+        assert moved.qvel[-1, 3] == 0.0

@@ -1,3 +1,4 @@
+import mujoco
 import numpy as np
 import pytest
 from small_worlds import BALL, BLOCK, FLOOR, MOTOR, PENDULUM, SLIDER, G, move, world
@@ -72,3 +73,17 @@ def test_size_scales_shapes_and_places_and_leaves_mass_and_inertia(xml):
     for name in ("geom_pos", "geom_rbound"):
         np.testing.assert_allclose(getattr(large, name)[mine], 1.25 * getattr(plain, name)[mine], atol=1e-9)
     np.testing.assert_allclose(large.geom_aabb[mine], 1.25 * plain.geom_aabb[mine], atol=1e-9)
+
+
+TOOL = """<mujoco><worldbody><body name="link"><joint name="hinge" axis="0 1 0"/><geom size="0.05" mass="1"/>
+<body name="frame"><body name="tool" pos="0 0 -0.1"><geom size="0.03" mass="0.5"/><site name="wrist"/></body></body>
+</body><body name="object" pos="1 0 0"><freejoint/><geom size="0.02"/>
+<body name="marker"><geom size="0.01"/></body></body>
+</worldbody><sensor><force name="load" site="wrist"/></sensor></mujoco>"""
+
+
+def test_what_is_fixed_to_a_link_may_be_heavier_than_the_model():
+    m = mujoco.MjModel.from_xml_string(TOOL)
+    assert Mass.targets(m) == (("object",), ("marker",), ("link",), ("tool",))
+    heavy = move(world(TOOL, Mass("tool"), 1.4), 0.1)
+    assert heavy.sensor["load"][-1, 2] == pytest.approx(1.4 * 0.5 * G, rel=1e-3)

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Read LeRobot data sets, MCAP files, ROS bags or folders of images as a recording, with a map of names, units and
-    signs: --suggest writes a first map, --dry-run shows and checks what it makes of the log. A scene of a BOP data set
-    needs neither model nor map.
+    """Read LeRobot data sets, MCAP files, ROS bags, tables or folders of images as a recording, with a map of names,
+    units and signs: --suggest writes a first map, --dry-run shows and checks what it makes of the log. A scene of a BOP
+    data set needs neither model nor map.
     """
 
     source: tyro.conf.Positional[tuple[Path, ...]]
-    """LeRobot v3 data set, .mcap, .bag, folder of a ROS 2 bag, or folder with color, depth and intrinsics.json; several
-    of them, or a folder of them; or a scene of a BOP data set."""
+    """LeRobot v3 data set, .mcap, .bag, folder of a ROS 2 bag, .csv, or folder with color, depth and
+    intrinsics.json; several of them, or a folder of them; or a scene of a BOP data set."""
     model: Path | None = None
     """MJCF of the scene: robot and objects with named actuators and sensors."""
     mapping: Annotated[Path | None, tyro.conf.arg(name="map")] = None

@@ -13,7 +13,13 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
-from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, formula_errors
+from concent_warp.fit.effects.intervals import (
+    NORMAL_QUANTILE,
+    FittedParameter,
+    covariance,
+    excludes_null,
+    formula_errors,
+)
 
 
 def assess(
@@ -43,7 +49,7 @@ def assess(
         reason = "the interval of its gain includes zero"
     elif folds[folds > 0].sum() < cfg.search.min_fold_share * np.abs(folds).sum():
         reason = "folds disagree"
-    elif not any(q.excludes_null for q in parameters):
+    elif not excludes_null(parameters, fitted_covariance(base, c), cfg.search.dependent_share):
         reason = "its parameters may be at their null values"
     elif any(q.at_bound for q in parameters):
         reason = "a parameter is at its bound"
@@ -71,18 +77,25 @@ def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedPara
     The error of the formula itself is included, see `formula_errors`.
     """
     prediction = base.prediction(c.effect)
-    std = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior))) if c.std is None else c.std
-    fresh = range(prediction.owned, len(prediction.parameters))
-    parameters, values = [prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :]
-    formula = formula_errors(c.effect, parameters, values, base.cfg.discretisation_error)
-    reaches = [
-        NORMAL_QUANTILE * np.hypot(std[k] * prediction.parameters[k].scale, formula[k - prediction.owned])
-        for k in fresh
-    ]
+    own = slice(prediction.owned, None)
+    parameters, values = prediction.parameters[own], c.fit.values[own]
+    reaches = NORMAL_QUANTILE * np.sqrt(np.diag(fitted_covariance(base, c)))
     return tuple(
-        FittedParameter.within(prediction.parameters[k], float(c.fit.values[k]), float(reach))
-        for k, reach in zip(fresh, reaches, strict=True)
+        FittedParameter.within(p, float(value), float(reach))
+        for p, value, reach in zip(parameters, values, reaches, strict=True)
     )
+
+
+def fitted_covariance(base: FittedModel, c: FittedCandidate) -> np.ndarray:
+    """Return the covariance of a candidate's own parameters, in their units (P, P), see `fitted_parameters`."""
+    prediction = base.prediction(c.effect)
+    own = slice(prediction.owned, None)
+    parameters, values = prediction.parameters[own], c.fit.values[own]
+    found = covariance(c.sums, base.blocks, base.cfg.least_squares.prior)[own, own]
+    scale, std = np.array([p.scale for p in parameters]), np.sqrt(np.diag(found))
+    wide = scale * (1.0 if c.std is None else c.std[own] / std)
+    formula = formula_errors(c.effect, parameters, values, base.cfg.discretisation_error)
+    return found * np.outer(wide, wide) + np.diag(formula**2)
 
 
 def profile_widening(base: FittedModel, c: FittedCandidate) -> np.ndarray:

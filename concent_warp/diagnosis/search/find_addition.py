@@ -24,7 +24,7 @@ from concent_warp.diagnosis.candidates.screening import linear_at_measured_state
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.adequacy import least_ratio
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
-from concent_warp.diagnosis.search.joint_fit import joint_parameters
+from concent_warp.diagnosis.search.joint_fit import established_effects, joint_parameters
 from concent_warp.diagnosis.search.nominal_values import nominal_errors, nominal_sensitivities
 from concent_warp.diagnosis.search.reconsider import near_best
 from concent_warp.diagnosis.time_budget import in_words
@@ -186,9 +186,10 @@ class AdditionFinder:
             added = add_candidate(base, c)
             widening = {len(added.model.effects) - 1: profile_widening(base, c)}
             nominal = None if shared is None else nominal_errors(added, self.context.cfg, shared)
-            parameters = joint_parameters(added, widening, nominal)[-1]
-            found[k] = replace(f, parameters=parameters)
-            if not any(p.excludes_null for p in parameters):
+            parameters = joint_parameters(added, widening, nominal)
+            found[k] = replace(f, parameters=parameters[-1])
+            share = self.context.cfg.search.dependent_share
+            if not established_effects(added, parameters, share, widening, nominal)[-1]:
                 found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
         return found
 

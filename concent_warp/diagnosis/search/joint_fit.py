@@ -10,12 +10,14 @@ import numpy as np
 from concent_warp.diagnosis.candidates.baseline import fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.result import Finding
+from concent_warp.effects.posterior import JointPosterior
 from concent_warp.fit.effects.cross_validation import Sums, block_sums, bootstrap_interval
 from concent_warp.fit.effects.intervals import (
     NORMAL_QUANTILE,
     FittedParameter,
     clustered_std,
     covariance,
+    excludes_null,
     formula_errors,
     joint_posterior,
 )
@@ -98,12 +100,47 @@ def with_intervals(
         nominal: As given to that.
     """
     prediction, fitted = last.prediction(), [p for group in parameters for p in group]
+    posterior = _posterior(last, prediction, fitted, widening, nominal)
+    return replace(last, model=prediction.model(last.fit.values, [(p.low, p.high) for p in fitted], posterior))
+
+
+def established_effects(
+    last: FittedModel,
+    parameters: Sequence[tuple[FittedParameter, ...]],
+    dependent_share: float,
+    widening: Mapping[int, np.ndarray] | None = None,
+    nominal: np.ndarray | None = None,
+) -> list[bool]:
+    """Return for each effect of a fitted model whether its values are not its null values, see `excludes_null`.
+
+    Args:
+        last: The fitted model.
+        parameters: What `joint_parameters` returned for it.
+        dependent_share: `SearchCfg.dependent_share`.
+        widening: As given to `joint_parameters`.
+        nominal: As given to that.
+    """
+    prediction, fitted = last.prediction(), [p for group in parameters for p in group]
+    covered = _posterior(last, prediction, fitted, widening, nominal).matrix
+    return [
+        excludes_null(group, covered[part, part], dependent_share)
+        for group, part in zip(parameters, prediction.split, strict=True)
+    ]
+
+
+def _posterior(
+    last: FittedModel,
+    prediction: Prediction,
+    fitted: Sequence[FittedParameter],
+    widening: Mapping[int, np.ndarray] | None,
+    nominal: np.ndarray | None,
+) -> JointPosterior:
+    """Return the posterior of all parameters of a fitted model, see `joint_parameters`."""
     sums, prior = block_sums(last.pieces, last.blocks, last.limit), last.cfg.least_squares.prior
     errors, scale = _errors(last, prediction, sums, widening, nominal), [p.scale for p in prediction.parameters]
     independent = np.hypot(errors.nominal, errors.formula / scale)
     covered = covariance(sums, last.blocks, prior)
-    posterior = joint_posterior(prediction.parameters, fitted, covered, errors.data, independent)
-    return replace(last, model=prediction.model(last.fit.values, [(p.low, p.high) for p in fitted], posterior))
+    return joint_posterior(prediction.parameters, fitted, covered, errors.data, independent)
 
 
 @dataclass(frozen=True)

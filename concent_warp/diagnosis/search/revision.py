@@ -18,6 +18,7 @@ from concent_warp.diagnosis.candidates.evidence import profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
 from concent_warp.diagnosis.search.joint_fit import (
+    established_effects,
     joint_finding,
     joint_parameters,
     refit_jointly,
@@ -209,7 +210,7 @@ class Revision:
         unsettled = "Left out of the intervals: errors of nominal values."
         nominal = attempt(lambda: nominal_errors(last, context.cfg), None, unsettled, TOGETHER_SHARE)
         parameters, linear = (joint_parameters(last, by, nominal) for by in (widening, None))
-        established = [any(p.excludes_null for p in linear[owned + k]) for k in range(len(accepted))]
+        established = established_effects(last, linear, context.cfg.search.dependent_share, None, nominal)[owned:]
         record.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
             alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
-from concent_warp.effects.select import SINGLE, dof_of, joints_by_type, typical_torque
+from concent_warp.effects.select import BEARINGS, SINGLE, dof_of, dofs_of, joints_by_type, typical_torque
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
@@ -31,15 +31,17 @@ class JointEffect(Effect):
     family = "joints"
     kind = "joint"
     requirement = "hinges and slides"
+    joint_types: ClassVar[tuple[int, ...]] = SINGLE
+    """Types of the joints that it acts on."""
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether the joint has one degree of freedom."""
-        return int(m.jnt_type[i]) in SINGLE
+        """Return whether the joint is of such a type."""
+        return int(m.jnt_type[i]) in self.joint_types
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return all hinges, and all slides."""
-        return joints_by_type(m)
+        """Return all hinges, all slides, and for some effects all ball joints."""
+        return joints_by_type(m, kinds=cls.joint_types)
 
     def units(self, m: mujoco.MjModel, hinge: str, slide: str) -> str:
         """Return the unit on the target's joints."""
@@ -57,6 +59,18 @@ class JointEffect(Effect):
         )
 
 
+class BearingEffect(JointEffect):
+    """An effect in the bearings of hinges, slides and ball joints, alike about each axis of a ball joint."""
+
+    requirement = "hinges, slides and ball joints"
+    joint_types = BEARINGS
+
+    def set_dofs(self, field: np.ndarray, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set values of the degrees of freedom, shape (nv,), of each joint to that of the joint, not below 0."""
+        dofs, rows = dofs_of(m, self.ids(m))
+        field[dofs] = np.maximum(values, 0.0)[rows]
+
+
 class DryFriction(JointEffect):
     """Friction that holds the joint at rest."""
 
@@ -72,7 +86,7 @@ class DryFriction(JointEffect):
                 joint.solimp_friction[:2] = FRICTION_IMPEDANCE
 
 
-class JointFriction(DryFriction):
+class JointFriction(DryFriction, BearingEffect):
     """Dry friction in joints."""
 
     name = "joint_friction"
@@ -96,10 +110,10 @@ class JointFriction(DryFriction):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the friction loss."""
-        m.dof_frictionloss[dof_of(m, self.ids(m))] = np.maximum(values, 0.0)
+        self.set_dofs(m.dof_frictionloss, m, values)
 
 
-class JointDamping(JointEffect):
+class JointDamping(BearingEffect):
     """Viscous friction in joints."""
 
     name = "joint_damping"
@@ -123,7 +137,7 @@ class JointDamping(JointEffect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the damping."""
-        m.dof_damping[dof_of(m, self.ids(m))] = np.maximum(values, 0.0)
+        self.set_dofs(m.dof_damping, m, values)
 
 
 class Armature(JointEffect):

@@ -6,21 +6,22 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.select import element_name, free_bodies, outermost_links
+from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links
 
 
 class BodyEffect(Effect):
-    """An effect on one body: a free one, or what an arm carries."""
+    """An effect on one body: a free one, the last link of an arm, or what is fixed to one of these."""
 
     family = "objects"
     kind = "body"
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body and each last link of an arm."""
+        """Return each free body, each last link of an arm, and what is fixed to these, such as a tool."""
         found = [
             element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)
-            for b in (*free_bodies(m), *outermost_links(m))
+            for moving in (*free_bodies(m), *outermost_links(m))
+            for b in moving_as_one(m, moving)
             if m.body_mass[b] > 0
         ]
         return tuple((n,) for n in found if n)

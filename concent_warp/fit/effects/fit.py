@@ -20,6 +20,7 @@ from concent_warp.fit.effects.intervals import (
     FittedParameter,
     clustered_std,
     covariance,
+    excludes_null,
     formula_errors,
     joint_posterior,
 )
@@ -283,8 +284,12 @@ def _remarks(
         ):
             unknown.add(k)
             found.append(f"The recording hardly determines {q.name}.")
+    std = np.array([max(q.high - q.value, q.value - q.low) / NORMAL_QUANTILE for q in parameters])
+    std = np.where(np.isfinite(std), std, 0.0)
+    covered, share = correlation * np.outer(std, std), 1 - cfg.max_correlation
     for effect, part in zip(solver.p.effects, solver.p.split, strict=True):
-        if not any(q.excludes_null for q in parameters[part]) and not set(range(len(parameters))[part]) <= unknown:
+        absent = not excludes_null(parameters[part], covered[part, part], share)
+        if absent and not set(range(len(parameters))[part]) <= unknown:
             found.append(f"{effect.name} may be absent: within its interval it does nothing.")
     for k in range(len(parameters)):
         for j in range(k):

@@ -51,18 +51,57 @@ def covariance(sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior)
     """Return the covariance of the parameters, in units of their scale, robust to correlation within blocks (P, P).
 
     H^-1 (sum_b u_b u_b') H^-1 B / (B - P), the sandwich of Liang and Zeger, Biometrika 73, 1986, but not below H^-1,
-    what independent noise of the stated size would leave. `prior` is `LeastSquaresCfg.prior`.
+    what independent noise of the stated size would leave. `prior` is `LeastSquaresCfg.prior`: combinations of which the
+    data say less, such as the difference of two joints that move as one, have no scores, and keep its variance.
     """
-    size = sums.slope.shape[1]
-    inverse = np.linalg.pinv(sums.normal.sum(axis=0) + np.eye(size) / prior**2, hermitian=True)
-    scores = sums.slope - sums.slope.mean(axis=0)
+    size, normal = sums.slope.shape[1], sums.normal.sum(axis=0)
+    inverse = np.linalg.pinv(normal + np.eye(size) / prior**2, hermitian=True)
+    scores = (sums.slope - sums.slope.mean(axis=0)) @ inverse
     correction = blocks.count / max(blocks.count - size, 1)
-    robust = inverse @ (scores.T @ scores) @ inverse * correction
+    robust = scores.T @ scores * correction + _left_to_the_prior(normal, prior)
     wider = np.sqrt(np.maximum(np.diag(robust), np.diag(inverse)))
     spread = np.sqrt(np.maximum(np.diag(robust), 1e-300))
     found = robust * np.outer(wider / spread, wider / spread)
     np.fill_diagonal(found, wider**2)  # also of parameters that nothing depends on, whose scores are all zero
     return found
+
+
+def _left_to_the_prior(normal: np.ndarray, prior: float) -> np.ndarray:
+    """Return the covariance of the combinations of parameters of which data say less than the prior, shape (P, P).
+
+    Args:
+        normal: Sum of squared sensitivities to the parameters in units of their scale, shape (P, P).
+        prior: See `LeastSquaresCfg.prior`.
+    """
+    curvature, axes = np.linalg.eigh(normal)
+    loose = curvature < 1 / prior**2
+    return (axes[:, loose] / (np.maximum(curvature[loose], 0.0) + 1 / prior**2)) @ axes[:, loose].T
+
+
+def excludes_null(fitted: Sequence[FittedParameter], covered: np.ndarray, dependent_share: float) -> bool:
+    """Return whether an interval of a parameter excludes its null value, or that of a combination of parameters does.
+
+    Where parameters stand in for one another, as the friction of two joints that move as one, each by itself may be
+    at its null value, but not all of them. The combinations are the principal axes of the parameters' correlations,
+    those of which the data leave a small share of what they leave of the parameters one by one.
+
+    Args:
+        fitted: Parameters of one effect.
+        covered: Their covariance, in their units, shape (P, P).
+        dependent_share: Variance of a combination, over that of the same combination of independent parameters, below
+            which it counts [-].
+    """
+    if any(q.excludes_null for q in fitted):
+        return True
+    std = np.sqrt(np.maximum(np.diag(covered), 0.0))
+    known = [k for k, q in enumerate(fitted) if np.isfinite([q.value, q.null, std[k]]).all() and std[k] > 0]
+    if len(known) < 2:
+        return False
+    away = np.array([fitted[k].value - fitted[k].null for k in known]) / std[known]
+    variance, axes = np.linalg.eigh(covered[np.ix_(known, known)] / np.outer(std[known], std[known]))
+    counts = variance < dependent_share
+    reach = NORMAL_QUANTILE * np.sqrt(np.maximum(variance[counts], 0.0))
+    return bool((np.abs(away @ axes[:, counts]) > np.maximum(reach, 1e-9)).any())
 
 
 def joint_posterior(

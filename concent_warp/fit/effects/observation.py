@@ -278,6 +278,8 @@ def start_spread(
                 position[dof : dof + 3], position[dof + 3 : dof + 6] = cfg.unknown_position, cfg.unknown_orientation
                 velocity[dof : dof + 3], velocity[dof + 3 : dof + 6] = cfg.unknown_velocity, cfg.unknown_spin
 
+    rates: dict[int, float] = {}
+
     def seen(dof: slice, std: float) -> None:
         here = np.arange(m.nv)[dof]
         here = here if measured is None else here[measured[here]]
@@ -290,6 +292,8 @@ def start_spread(
         if kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
             dof = int(m.jnt_dofadr[target])
             seen(slice(dof, dof + 1), std)
+        elif kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL):
+            rates[int(m.jnt_dofadr[target])] = cfg.state_noise * std
         elif kind == int(mujoco.mjtSensor.mjSENS_TENDONPOS):
             first = m.tendon_adr[target]
             for w in range(first, first + m.tendon_num[target]):
@@ -304,6 +308,9 @@ def start_spread(
                 continue
             dof = int(m.jnt_dofadr[joint]) + 3 * (kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
             seen(slice(dof, dof + 3), std)
+    for dof, std in rates.items():  # of joints whose position was measured too, the velocity is estimated from both
+        if measured is not None and not measured[dof]:
+            velocity[dof] = std
     return np.concatenate([position, velocity])
 
 

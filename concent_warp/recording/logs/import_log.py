@@ -23,6 +23,7 @@ from concent_warp.recording.logs.readers.log import Log
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.unwind import unwound
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
@@ -43,8 +44,8 @@ def import_log(
     """Read logs of another system as a recording.
 
     Args:
-        source: LeRobot v3 data set, MCAP file, ROS bag, or folder of colour and depth images; several of them, or a
-            folder of them; or one scene of a BOP data set, which needs neither model nor mapping.
+        source: LeRobot v3 data set, MCAP file, ROS bag, table (.csv), or folder of colour and depth images; several of
+            them, or a folder of them; or one scene of a BOP data set, which needs neither model nor mapping.
         model: Scene, or MJCF file of it, with named actuators and sensors.
         cfg: Settings.
         mapping: Map of names, units and signs, or a TOML file of it.
@@ -75,6 +76,7 @@ def import_log(
     else:
         recording = _mapped(sources, model, mapping, cfg, progress)
     validate(recording)
+    recording = unwound(recording)
     if out is not None:
         write_hdf5(recording, out)
     if progress is not None:

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.logs.cfg import PlausibilityCfg
 from concent_warp.recording.logs.numbers import Numbers
+from concent_warp.recording.unwind import TURN, continued, wraps
 
 DEGREE = math.pi / 180
 
 
 def check_numbers(channels: Sequence[Numbers], cfg: PlausibilityCfg) -> Iterator[RecordingError]:
     """Yield what is wrong with units and signs of joints."""
-    suspects = set()
+    suspects, channels = set(), [_continued(one) for one in channels]
     for one in channels:
         if one.target.position and (error := _degrees(one, cfg)):
             suspects.add(one.label)
@@ -72,6 +74,15 @@ def check_overlap(times: Mapping[str, np.ndarray]) -> RecordingError | None:
                 fix="set its unit or offset in [clock], or take the times of reception with use = \"received\"",
             )  # fmt: skip
     return None
+
+
+def _continued(one: Numbers) -> Numbers:
+    """Return the angles of a joint without the jumps of an instrument that begins anew after each turn."""
+    target, value = one.target, one.value[:, 0]
+    narrow = target.range is not None and target.range[1] - target.range[0] < TURN
+    if not target.position or target.quantity != "angle" or narrow or not wraps(one.time, value, TURN):
+        return one
+    return replace(one, value=continued(value)[:, None])
 
 
 def _degrees(one: Numbers, cfg: PlausibilityCfg) -> RecordingError | None:

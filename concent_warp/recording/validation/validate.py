@@ -20,6 +20,7 @@ from concent_warp.limits import limits, raising
 from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, PolicyLog, Recording
+from concent_warp.recording.unwind import commanded_hinge, measured_hinge, wraps
 from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.clocks import check_clocks
 from concent_warp.recording.validation.covariances import check_covariance
@@ -157,6 +158,8 @@ def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Err
     if channel.covariance is not None:
         raise place.error("a command has no covariance", fix="leave it out")
     check_command(np.asarray(channel.value), model, row, place, cfg.units)
+    if commanded_hinge(model, name) is not None:
+        _check_turns(np.asarray(channel.time), np.asarray(channel.value), place)
 
 
 def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation, cfg: ValidateCfg) -> None:
@@ -182,6 +185,8 @@ def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: E
     if quaternion:
         _check_quaternions(value, place, cfg)
     check_measurement(value, model, row, place, cfg.units)
+    if measured_hinge(model, name) is not None:
+        _check_turns(np.asarray(channel.time), value[:, 0], place)
 
 
 def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: ErrorLocation, cfg: ValidateCfg) -> None:
@@ -227,6 +232,10 @@ def _check_time(time: np.ndarray, place: ErrorLocation) -> None:
             "wrong number of samples", expected=f"1 to {limits().samples}", fix=raising("samples"), found=len(time)
         )
     if (bad := _first(~(np.abs(time) <= MAX_MAGNITUDE))) is not None:
+        if np.isfinite(time[bad]):
+            found = f"{time[bad]:.4g}"
+            fix = "write seconds from the start of the demonstration"
+            raise place.error("its time looks like nanoseconds", row=bad, expected="seconds", found=found, fix=fix)
         raise place.error("time is not finite", row=bad, expected="seconds", found=time[bad])
     if time[0] < 0:
         raise place.error("time is negative", row=0, expected=">= 0 s", found=f"{time[0]:g} s", fix="count from 0")
@@ -270,6 +279,17 @@ def _check_finite(value: np.ndarray, place: ErrorLocation, *, missing_allowed: b
             expected="a number",
             found="NaN",
             fix="leave the samples out, so that the value before them stays in force",
+        )
+
+
+def _check_turns(time: np.ndarray, value: np.ndarray, place: ErrorLocation) -> None:
+    """Refuse angles, shape (T,), of a hinge without end that begin anew after each 360."""
+    if wraps(time, np.asarray(value, dtype=float), 360.0):
+        raise place.error(
+            "its values look like degrees",
+            expected="rad, which begin anew after 6.283 or never",
+            found=f"{np.nanmin(value):.4g} to {np.nanmax(value):.4g}, with jumps of 360",
+            fix="write radians",
         )
 
 

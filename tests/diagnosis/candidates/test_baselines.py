@@ -237,6 +237,7 @@ def test_points_of_a_profile_stay_within_bounds_and_go_on_where_the_cost_rises_l
         ({"excludes": (False, False)}, "its parameters may be at their null values"),
         ({"bounds": (False, True)}, "a parameter is at its bound"),
         ({"excludes": (True, False)}, ""),
+        ({"excludes": (False, False), "together": True}, ""),
     ],
 )
 def test_an_effect_is_accepted_unless_there_is_a_reason_against_it(monkeypatch, changes, reason):
@@ -247,6 +248,7 @@ def test_an_effect_is_accepted_unless_there_is_a_reason_against_it(monkeypatch, 
         "folds": (1,) * 5,
         "excludes": (True, True),
         "bounds": (False,) * 2,
+        "together": False,
     }
     values |= changes
     parameters = tuple(
@@ -254,6 +256,9 @@ def test_an_effect_is_accepted_unless_there_is_a_reason_against_it(monkeypatch, 
     )
     monkeypatch.setattr(evidence, "bootstrap_interval", lambda *_: (values["low"], 0.9))
     monkeypatch.setattr(evidence, "fitted_parameters", lambda *_: parameters)
+    monkeypatch.setattr(evidence, "fitted_covariance", lambda *_: np.eye(2))
+    together = values["together"]
+    monkeypatch.setattr(evidence, "excludes_null", lambda each, *_: together or any(q.excludes_null for q in each))
     monkeypatch.setattr(evidence, "removed_by_channel", lambda *_: (("angle", 0.5),))
     monkeypatch.setattr(evidence, "sign_flip_p", lambda *_: 0.02)
     monkeypatch.setattr(evidence, "null_p_value", lambda _null, gain: 0.001 if np.isinf(gain) else values["p"])

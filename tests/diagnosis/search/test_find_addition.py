@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search import find_addition
 from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.made_up import CLEAR, OPEN, finding, node, procedure
@@ -180,7 +181,12 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
         assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name} at base")
         return [(CLEAR,), tuple(ends[c.name])]
 
+    def established(_c, parameters, share, *rest):
+        assert (share, len(rest)) == (DiagnoseCfg().search.dependent_share, 2)
+        return [any(p.excludes_null for p in group) for group in parameters]
+
     monkeypatch.setattr(find_addition, "joint_parameters", answer)
+    monkeypatch.setattr(find_addition, "established_effects", established)
     gains = {"a": (0.9, True), "b": (0.7, True), "c": (0.6, False)}
     for explained, added, seen in ((False, "a", ["a", "b"]), (True, "b", ["b"])):
         made = procedure()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure as module
-from concent_warp.diagnosis.cfg import NominalCfg, SearchCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
 from concent_warp.diagnosis.search import additions, context, revision
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.simulate.time_limit import TimeUpError
@@ -417,9 +417,14 @@ def test_effects_are_established_by_intervals_that_the_profile_likelihood_does_n
         asked.append((last, widening, nominal))
         return narrow if widening is None else wide
 
+    def any_excludes(_last, parameters, share, widening, nominal):
+        assert (share, widening, nominal) == (DiagnoseCfg().search.dependent_share, None, "nominal")
+        return [any(p.excludes_null for p in group) for group in parameters]
+
     made, last = procedure(), node(1.0, effects=5)  # one effect of its own, four added
     monkeypatch.setattr(made.revision, "_joint", lambda _: last)
     monkeypatch.setattr(revision, "joint_parameters", intervals)
+    monkeypatch.setattr(revision, "established_effects", any_excludes)
     monkeypatch.setattr(revision, "nominal_errors", lambda *_: "nominal")
     monkeypatch.setattr(revision, "refit_without_effect", lambda _, k: f"without {k}")
     monkeypatch.setattr(revision, "joint_finding", lambda f, parameters, *_: replace(f, parameters=parameters))

@@ -192,6 +192,9 @@ def test_an_effect_that_may_be_absent_is_remarked_unless_nothing_is_known_of_it(
     assert remarks(fitted("a", -1.0, 2.0), fitted("b", -1.0, 2.0), split=both) == [absent]
     half = remarks(fitted("a", -99.0, 99.0), fitted("b", -1.0, 2.0), split=both)
     assert half == ["The recording hardly determines a.", absent]
+    fingers = fitted("a", -0.5, 2.5), fitted("b", -0.5, 2.5)
+    assert absent in remarks(*fingers, split=both, correlation=[[1, 0.999], [0.999, 1]])
+    assert absent not in remarks(*fingers, split=both, correlation=[[1, -0.999], [-0.999, 1]])
     second = remarks(fitted("a", 1.0, 2.0), fitted("b", -1.0, 2.0))
     assert second == ["effect_1 may be absent: within its interval it does nothing."]
 

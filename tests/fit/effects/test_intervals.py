@@ -1,5 +1,7 @@
 """Intervals of fitted parameters against their formulas, on sums of a few blocks written by hand."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from concent_warp.fit.effects.intervals import (
     clustered_std,
     covariance,
     discretisation_errors,
+    excludes_null,
     formula_errors,
 )
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg
@@ -158,3 +161,25 @@ def test_blocks_of_different_demonstrations_are_no_neighbours():
 )
 def test_an_interval_excludes_the_null_value_where_it_does_not_reach_it(low, high, null, excluded):
     assert FittedParameter("a", 0.5 * low, low, high, "N", null).excludes_null is excluded
+
+
+def alike(residual: np.ndarray) -> Sums:
+    """Return the sums of two parameters of which the residuals show the sum only, ten blocks of some rows."""
+    motion = np.random.default_rng(0).normal(0, 300.0, len(residual))
+    j, r = np.stack([motion, motion], axis=1).reshape(10, -1, 2), residual.reshape(10, -1)
+    return Sums(np.einsum("bri,brj->bij", j, j), np.einsum("bri,br->bi", j, r), (r**2).sum(axis=1))
+
+
+def test_parameters_that_stand_in_for_one_another_are_uncertain_one_by_one_but_not_in_sum():
+    found = covariance(alike(np.random.default_rng(1).normal(0, 5, 500)), blocks_of(10))
+    assert np.linalg.eigvalsh(found).min() >= -1e-9 * np.abs(found).max()
+    assert np.diag(found) == pytest.approx([PRIOR**2 / 2] * 2, rel=0.01)
+    assert found.sum() < 1e-3
+    fitted = [FittedParameter(n, v, 0.0, v + 14, "N", 0.0) for n, v in (("left", 0.3), ("right", 0.0))]
+    assert not any(q.excludes_null for q in fitted)
+    assert excludes_null(fitted, found, 0.1)
+    assert not excludes_null(fitted, np.diag(np.diag(found)), 0.1)
+    absent = [replace(q, value=0.0) for q in fitted]
+    assert not excludes_null(absent, found, 0.1)
+    limit = FittedParameter("limit", np.inf, np.inf, np.inf, "N", np.inf)
+    assert not excludes_null([limit, limit], np.eye(2), 0.1)

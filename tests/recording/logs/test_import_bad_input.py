@@ -360,8 +360,8 @@ def test_tables_that_are_none_are_refused(images):
     path = images / "log" / "joints.csv"
     path.write_text("elbow,grip\n0,1\n")
     assert "a table has no times" in refused(images, "log", IMAGES_MAP)
-    path.write_text("time,elbow,grip\n0,one,2\n")
-    assert "joints.csv, line 2: a cell is not a number" in refused(images, "log", IMAGES_MAP)
+    path.write_text("time,elbow,grip\n0,one,2\n1,1,2\n")
+    assert "joints.csv, line 2: a cell of column 'elbow' is not a number" in refused(images, "log", IMAGES_MAP)
 
 
 def test_paths_that_are_no_logs_are_refused(tmp_path):

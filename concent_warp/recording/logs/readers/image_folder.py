@@ -11,7 +11,6 @@ A time in whole numbers is taken as ns, us or ms by its size, one with a decimal
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from concent_warp.documents import is_number, read_json
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.logs.readers.calibration import Calibration, distortion_of, numbers
+from concent_warp.recording.logs.readers.csv_table import seconds, table_rows, table_signals
 from concent_warp.recording.logs.readers.image_files import SUFFIXES, read_image
 from concent_warp.recording.logs.readers.kinds import COLOUR_FOLDERS, DEPTH_FOLDERS, INTRINSICS
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
@@ -33,9 +33,6 @@ STAMPS = "timestamps.csv"
 NUMBER = re.compile(r"\d+(?:[.]\d+)?")
 NESTED = ("color", "colour", "rgb", "rgb_intrinsic", "color_intrinsics", "intrinsics", "camera")
 """Entries of ``intrinsics.json`` that may hold those of the colour camera, to which depths are registered."""
-COMMANDS = ("action", "command", "cmd", "goal", "target")
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-"""Whole numbers above the first are since 1970 in units of the second [s]."""
 
 
 class ImageFolder:
@@ -66,7 +63,7 @@ class ImageFolder:
         signals: dict[str, Signal] = {}
         for table in sorted(self.source.glob("*.csv")):
             if table.name != STAMPS:
-                signals |= _signals(table)
+                signals |= table_signals(table, f"{table.stem}/")
         return Episode(number, signals, images, calibration=calibration)
 
     def _document(self) -> tuple[Mapping[str, Any] | None, Path]:
@@ -173,15 +170,7 @@ def _time_of(path: Path, stamps: Mapping[str, float]) -> float:
     if not found:
         fix = f"write {STAMPS} with rows file,time"
         raise RecordingError("an image has no time in its name", where=path, expected="a number", fix=fix)
-    return _seconds(found[-1])
-
-
-def _seconds(text: str) -> float:
-    """Return a time in a file's name or in `STAMPS` [s]: whole numbers since 1970 by their size."""
-    value = float(text)
-    if "." not in text:
-        return next((value * unit for least, unit in EPOCHS if value >= least), value)
-    return next((value * unit for least, unit in EPOCHS[1:] if value >= least), value)
+    return seconds(found[-1])
 
 
 def _stamps(path: Path) -> dict[str, float]:
@@ -189,54 +178,14 @@ def _stamps(path: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     found = {}
-    for line, cells in _rows(path):
+    for line, cells in table_rows(path):
         if len(cells) != 2:
             where = f"{path}, line {line}"
             raise RecordingError("wrong number of columns", where=where, expected="file,time", found=len(cells))
         try:
-            found[cells[0].strip()] = _seconds(cells[1].strip())
+            found[cells[0].strip()] = seconds(cells[1].strip())
         except ValueError:
             if line > 1:  # the first may be a header
                 where, text = f"{path}, line {line}", repr(cells[1])
                 raise RecordingError("not a time", where=where, expected="a number", found=text) from None
     return found
-
-
-def _signals(path: Path) -> dict[str, Signal]:
-    """Return the columns of a table whose first is the time."""
-    rows = _rows(path)
-    header = [name.strip() for name in next(rows, (0, [""]))[1]]
-    if len(header) < 2 or header[0].lower() not in ("time", "timestamp", "stamp", "t"):
-        expected = "time,<name>,... in the first line"
-        raise RecordingError("a table has no times", where=f"{path}, line 1", expected=expected, found=",".join(header))
-    table: list[list[float]] = []
-    for line, cells in rows:
-        if len(cells) != len(header):
-            raise RecordingError(
-                "wrong number of columns", where=f"{path}, line {line}", expected=len(header), found=len(cells)
-            )
-        try:
-            table.append([_seconds(cells[0].strip()), *(float(cell) if cell.strip() else np.nan for cell in cells[1:])])
-        except ValueError as error:
-            where = f"{path}, line {line}"
-            raise RecordingError("a cell is not a number", where=where, found=str(error)) from None
-    if not table:
-        raise RecordingError("a table has no rows below its header", where=path)
-    values = np.array(table)
-    command = any(word in path.stem.lower() for word in COMMANDS)
-    names = (f"{path.stem}/{name}" for name in header[1:])
-    return {name: Signal(name, values[:, 0], values[:, 1 + k], command=command) for k, name in enumerate(names)}
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a CSV file that are not blank, each with its line number."""
-    if path.stat().st_size > limits().file_bytes:
-        raise RecordingError("the table is too large", where=path, fix=raising("file_bytes"))
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            for cells in reader:
-                if cells:
-                    yield reader.line_num, cells
-    except (csv.Error, UnicodeDecodeError, OSError) as error:
-        raise RecordingError("not a CSV file", where=path, expected="UTF-8 text", found=error) from None

@@ -8,12 +8,13 @@ from typing import Literal
 
 from concent_warp.errors import RecordingError
 
-LogKind = Literal["lerobot", "ros", "images", "bop"]
+LogKind = Literal["lerobot", "ros", "images", "bop", "table"]
 KINDS = (
     "a LeRobot v3 data set (folder with meta/info.json), an MCAP file (.mcap), a ROS bag (.bag, .db3, or folder with "
-    "metadata.yaml), a folder with intrinsics.json and folders of colour and depth images, a scene of a BOP data set "
-    "(folder with scene_camera.json), or a folder of logs"
+    "metadata.yaml), a table (.csv), a folder with intrinsics.json and folders of colour and depth images, a scene of "
+    "a BOP data set (folder with scene_camera.json), or a folder of logs"
 )
+TABLES = (".csv", ".tsv")
 BAGS = (".mcap", ".bag", ".db3")
 COLOUR_FOLDERS = ("color", "colour", "rgb", "image", "images", "left")
 DEPTH_FOLDERS = ("depth", "aligned_depth", "aligned_depth_to_color", "depth_aligned")
@@ -34,6 +35,8 @@ def log_kind(path: Path) -> LogKind | None:
         if folders & {*COLOUR_FOLDERS, *DEPTH_FOLDERS} or any((path / name).exists() for name in INTRINSICS):
             return "images"
         return None
+    if path.suffix.lower() in TABLES and path.exists():
+        return "table"
     return "ros" if path.suffix.lower() in BAGS and path.exists() else None
 
 

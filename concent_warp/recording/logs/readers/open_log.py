@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from concent_warp.errors import RecordingError
+from concent_warp.recording.logs.readers.csv_table import CsvTable
 from concent_warp.recording.logs.readers.image_folder import ImageFolder
 from concent_warp.recording.logs.readers.kinds import KINDS, log_kind
 from concent_warp.recording.logs.readers.lerobot import LeRobotLog
@@ -13,7 +14,7 @@ from concent_warp.recording.logs.readers.ros import RosLog
 
 
 def open_log(path: Path | str) -> Log:
-    """Open a LeRobot data set, an MCAP file, a ROS bag or a folder of images.
+    """Open a LeRobot data set, an MCAP file, a ROS bag, a table or a folder of images.
 
     Raises:
         RecordingError: There is none of them, or its description cannot be read.
@@ -28,6 +29,8 @@ def open_log(path: Path | str) -> Log:
         return RosLog(path)
     if kind == "images":
         return ImageFolder(path)
+    if kind == "table":
+        return CsvTable(path)
     if kind == "bop":
         raise RecordingError("a scene of a BOP data set is no log with a map", where=path, fix="import it without one")
     if path.suffix in (".h5", ".hdf5", ".pt"):

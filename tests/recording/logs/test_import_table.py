@@ -1,0 +1,81 @@
+"""Tables of numbers, as most robots' own loggers write them."""
+
+import numpy as np
+import pytest
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.load import load_recording
+from concent_warp.recording.logs.import_log import import_log
+from concent_warp.recording.logs.readers.csv_table import table_signals
+from concent_warp.recording.logs.suggest import suggest_map
+
+SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-2 2"/><geom size="0.1" mass="1"/></body>
+<body name="block" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody>
+<actuator><position name="hinge" joint="hinge" kp="5"/></actuator>
+<sensor><jointpos name="hinge_position" joint="hinge"/><framepos name="block_position" objtype="body" objname="block"/>
+<framequat name="block_orientation" objtype="body" objname="block"/></sensor></mujoco>"""
+MAP = """[action.hinge]
+source = "cmd_hinge"
+unit = "deg"
+[measured.hinge_position]
+source = "hinge"
+unit = "deg"
+[measured.block_position]
+source = ["x", "y", "z"]
+[measured.block_orientation]
+source = ["qx", "qy", "qz", "qw"]
+order = "xyzw"
+"""
+TIME = np.arange(0, 2, 0.01)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "map.toml").write_text(MAP)
+    rows = [f"{1764000000 + t:.6f};{20 * np.sin(t):.5f};{20 * np.sin(t):.5f};0.1;0;;0;0;0;1;push" for t in TIME]
+    rows[50], rows[51] = rows[51], rows[50]
+    rows.insert(70, rows[70])
+    header = "timestamp;hinge;cmd_hinge;x;y;z;qx;qy;qz;qw;mode"
+    (tmp_path / "log.csv").write_text("\n".join([header, *rows]))
+    return tmp_path
+
+
+def test_a_table_becomes_a_recording(folder):
+    with pytest.raises(RecordingError, match="this is a table, not yet a recording; read it with `concent import"):
+        load_recording(folder / "log.csv")
+    (d,) = import_log(folder / "log.csv", folder / "robot.xml", mapping=folder / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["hinge_position"].time, TIME, atol=1e-5)
+    np.testing.assert_allclose(d.measured["hinge_position"].value[:, 0], np.radians(20 * np.sin(TIME)), atol=1e-6)
+    np.testing.assert_allclose(d.action["hinge"].value, np.radians(20 * np.sin(TIME)), atol=1e-6)
+    assert np.isnan(d.measured["block_position"].value[:, 2]).all()
+    np.testing.assert_allclose(d.measured["block_orientation"].value[0], [1, 0, 0, 0])
+
+
+def test_a_map_is_suggested_from_the_names_of_columns(folder):
+    text = suggest_map(folder / "log.csv", folder / "robot.xml")
+    assert 'source = "cmd_hinge"\nunit = "deg"' in text
+    assert 'source = "hinge"\nunit = "deg"' in text
+
+
+@pytest.mark.parametrize(("name", "text"), [("t_ms", "1500"), ("time [us]", "1500000"), ("timestamp_ns", "1500000000")])
+def test_the_name_of_the_times_may_state_their_unit(tmp_path, name, text):
+    (tmp_path / "a.csv").write_text(f"a,{name}\n1,{text}\n")
+    assert table_signals(tmp_path / "a.csv")["a"].time == pytest.approx([1.5])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "a table has no times; expected names in the first line, one of them time or timestamp"),
+        ("t,a,a\n1,2,3\n", r"two columns of a table have the same name.*\['a'\]"),
+        ("t,a\n1,2,3\n", "line 2: wrong number of columns; expected 2, found 3"),
+        ("t,a\nx,2\n", "line 2: a time is not a number"),
+        ("t,a\n1,2\n2,x\n", "line 3: a cell of column 'a' is not a number; found 'x'"),
+        ("t,a\n", "no rows below its header"),
+    ],
+)
+def test_what_is_no_table_of_numbers_is_refused(tmp_path, text, message):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        table_signals(tmp_path / "a.csv")

@@ -1,0 +1,43 @@
+"""Actuators with a state of their own begin where the first command would have left them."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.activation import initial_activation
+from concent_warp.simulate.engine import Variants
+from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.simulate.warp_engine import WarpEngine
+
+SCENE = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/><worldbody>
+<body><joint name="one" axis="0 0 1" damping="1"/><geom size="0.1" mass="1"/></body>
+<body pos="1 0 0"><joint name="two" axis="0 0 1" damping="1"/><geom size="0.1" mass="1"/></body>
+</worldbody><actuator>
+<position name="filtered" joint="one" kp="20" timeconst="0.3"/>
+<intvelocity name="moved" joint="two" kp="20" gear="2"/>
+<motor name="plain" joint="two"/>
+</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
+def test_a_servo_with_a_filter_or_an_integrator_holds_the_pose_that_it_begins_in(engine):
+    simulator = engine(Model(Scene(SCENE)))
+    qpos = np.array([[0.8, -0.5], [0.3, 0.2]])
+    ctrl = np.zeros((2, 100, 3))
+    ctrl[:, :, 0] = qpos[:, :1]
+    found = simulator.run(Variants(2, qpos=qpos), ctrl).numpy()
+    np.testing.assert_allclose(found.qpos, np.repeat(qpos[:, None], 101, axis=1), atol=1e-5)
+
+
+def test_activations_keep_within_their_ranges_and_others_are_zero():
+    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+    <body><joint name="j" range="-2 2"/><geom size="0.1"/></body></worldbody><actuator>
+    <general joint="j" dyntype="filter" dynprm="0.1" ctrlrange="-1 1" ctrllimited="true"/>
+    <muscle joint="j"/><general joint="j" dyntype="integrator"/>
+    <general joint="j" dyntype="filterexact" dynprm="0.1" actrange="-0.2 0.2" actlimited="true"/>
+    </actuator></mujoco>""")
+    np.testing.assert_allclose(
+        initial_activation(m, mujoco.MjData(m), np.array([3.0, 0.4, 5.0, 0.7])), [1, 0.4, 0, 0.2]
+    )
