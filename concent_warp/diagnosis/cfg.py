@@ -8,7 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Count, OpenShare, Positive, PositiveDuration, PositiveShare, Share, WindowLength
+from concent_warp.checks import (
+    Bounds,
+    Count,
+    Factor,
+    OpenShare,
+    Positive,
+    PositiveDuration,
+    PositiveShare,
+    Share,
+    WindowLength,
+)
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -351,6 +361,10 @@ class DiagnoseCfg:
     """Test for errors of the model's own time step."""
     nominal: NominalCfg = field(default_factory=NominalCfg)
     """Nominal values within their tolerance."""
+    doubtful_replay: Factor = 10.0
+    """Residual over noise of the better model, replayed in one piece, above which the answer says so [-]. Windows
+    forgive what a replay does not; errors of formulas grow along it, so that right answers have several times the
+    noise."""
     failures: FailureCfg = field(default_factory=FailureCfg)
     """Where the model as given fails."""
     experiment: SuggestExperimentCfg = field(default_factory=SuggestExperimentCfg)

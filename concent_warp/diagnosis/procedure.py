@@ -22,6 +22,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.check_data import check_data, noise_remarks, start_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
+from concent_warp.diagnosis.replayed import Replayed, replayed
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
@@ -330,6 +331,7 @@ class Procedure:
         where = budget.attempt(lambda: () if explained else self._failures(given), (), unsettled)
         experiment = budget.attempt(lambda: None if explained else self._suggested_experiment(), None, unsettled)
         after = fitted[1:] if fitted[0] is given else fitted
+        alike = budget.attempt(lambda: self._replayed(given, last) if named and cfg.explain else None, None, unsettled)
         return Diagnosis(
             verdict=verdict,
             effects=tuple(sorted(record.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
@@ -345,11 +347,17 @@ class Procedure:
             unknown_force=unknown,
             form_error=form_error if named else None,
             remainder_searched=not budget.cut if named else None,
+            replayed=alike,
             time_step=record.time_step,
             nominal_values=record.nominal_values,
             unsettled=tuple(budget.unsettled),
             explains=verdict != "none_of_these" or unexplained <= 1 - cfg.min_explained,
         )
+
+    def _replayed(self, given: FittedModel, last: FittedModel) -> Replayed | None:
+        """Return what a replay in one piece says of the last model."""
+        limit = self.context.cfg.doubtful_replay
+        return replayed(given.model, last.delivered, self.recording, last.windows, limit, self.engine)
 
     def _said_of_impacts(self) -> tuple[str, ...]:
         """Return a sentence on what the answer leaves of impacts, none where it leaves nothing."""

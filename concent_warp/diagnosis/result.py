@@ -10,6 +10,7 @@ import numpy as np
 
 from concent_warp.comparison.units import p_value_text
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
+from concent_warp.diagnosis.replayed import Replayed
 from concent_warp.diagnosis.result_html import diagnosis_html
 from concent_warp.effects.table import posteriors_table
 from concent_warp.fit.effects.intervals import FittedParameter
@@ -215,6 +216,9 @@ class Diagnosis:
     remainder_searched: bool | None = None
     """Whether the search for further effects beside the accepted ones came to its end; False where the time ended it,
     so that something smaller may be missing too; None where the verdict is another one than "effect" or "group"."""
+    replayed: Replayed | None = None
+    """What a replay in one piece says of `model`; None where the verdict is another one than "effect" or "group", or
+    it was not done."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
     nominal_values: tuple[FittedParameter, ...] = ()
@@ -258,6 +262,7 @@ class Diagnosis:
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
             "form_error": self.form_error,
             "remainder_searched": self.remainder_searched,
+            "replayed": None if self.replayed is None else self.replayed.to_json(),
             "time_step": None if self.time_step is None else self.time_step.to_json(),
             "nominal_values": [_parameter(p) for p in self.nominal_values],
             "posterior": self._posterior(),
@@ -304,6 +309,8 @@ class Diagnosis:
             )
         if self.remainder_searched is False:
             said.append("Whether something smaller is missing too was not settled in this time.")
+        if self.replayed is not None and self.replayed.doubtful:
+            said.append(self.replayed.sentence)
         return said
 
     def _repr_html_(self) -> str:

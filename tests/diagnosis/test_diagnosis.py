@@ -121,7 +121,7 @@ def test_json_has_the_share_of_errors_in_formulas_and_null_where_there_is_none()
     found = diagnosis().to_json()
     assert found["form_error"] is None
     keys = list(found)
-    assert keys.index("form_error") == keys.index("unknown_force") + 1 == keys.index("time_step") - 2
+    assert keys.index("form_error") == keys.index("unknown_force") + 1 == keys.index("remainder_searched") - 1
 
 
 def test_nominal_values_are_told_as_factors_and_latencies_with_their_unit():

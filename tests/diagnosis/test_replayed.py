@@ -1,0 +1,67 @@
+"""What a replay in one piece says of an answer that was judged by windows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from concent_warp.comparison.compare import CompareCfg, compare
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.diagnose import diagnose
+from concent_warp.diagnosis.replayed import Replayed, replayed
+from concent_warp.fit.effects.observe import observe
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from tests.diagnosis.test_diagnosis import diagnosis
+from tests.diagnosis.test_failures import XML, recorded
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return recorded(damping=1.5)
+
+
+def test_a_replay_has_the_residuals_that_a_comparison_shows(recording):
+    given, better = (Model(Scene(XML.format(damping=damping))) for damping in (0.5, 1.5))
+    windows = observe(given, recording)
+    found = replayed(given, better, recording, windows, 10.0, "mujoco")
+    assert found is not None
+    shown = compare({"given": given, "better": better}, recording, CompareCfg(phases="none"))
+    assert found.better == pytest.approx(shown.summarise("better", "rail_position").ratio)
+    assert found.better == pytest.approx(1.0, abs=0.2)
+    assert found.given == pytest.approx(shown.summarise("given", "rail_position").ratio)
+    assert found.given > 20
+    assert found.window == pytest.approx(max(w.end - w.start for w in windows))
+    assert not found.doubtful
+    other = replayed(better, given, recording, windows, 10.0, "mujoco")
+    assert other is not None
+    assert other.doubtful
+
+
+def test_a_diagnosis_replays_its_better_model(recording):
+    model = Model(Scene(XML.format(damping=0.5)))
+    cfg = DiagnoseCfg(effects=("joint_damping", "mass"), jobs=1)
+    found = diagnose(model, recording, cfg)
+    assert [f.name for f in found.accepted] == ["joint_damping"]
+    assert found.replayed is not None
+    assert found.replayed.better < 1.5 < 20 < found.replayed.given
+    assert found.to_json()["replayed"]["doubtful"] is False
+    assert not any("in one piece" in sentence for sentence in found.sentences())
+
+
+def test_a_replay_that_is_far_off_is_said_and_one_that_was_not_done_is_not():
+    far = diagnosis(replayed=Replayed(4200.0, 165.4, 0.25, True))
+    (said,) = (sentence for sentence in far.sentences() if "in one piece" in sentence)
+    for number in ("165 x", "4.2e+03 x", "0.25 s"):
+        assert number in said
+    for other in (replace(far, replayed=None), replace(far, replayed=Replayed(40.0, 2.0, 0.25, False))):
+        assert not any("in one piece" in sentence for sentence in other.sentences())
+    assert diagnosis().to_json()["replayed"] is None
+
+
+def test_a_recording_that_cannot_be_replayed_says_nothing(recording):
+    model = Model(Scene(XML.format(damping=0.5)))
+    channel = recording[0].measured["rail_position"]
+    unread = replace(channel, value=np.full_like(channel.value, np.nan))
+    empty = replace(recording, demonstrations=(replace(recording[0], measured={"rail_position": unread}),))
+    assert replayed(model, model, empty, observe(model, recording), 10.0, "mujoco") is None
