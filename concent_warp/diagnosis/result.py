@@ -248,6 +248,8 @@ class Diagnosis:
         """The verdict in words; where effects were accepted and a discrepancy is left, it says both."""
         if self.verdict == "none_of_these" and self.accepted:
             return "the library explains a part; something is missing that none of its effects explains"
+        if self.replayed is not None and self.replayed.doubtful:
+            return f"{VERDICTS[self.verdict]}, over short windows"
         return VERDICTS[self.verdict]
 
     def to_json(self) -> dict[str, Any]:

@@ -54,8 +54,10 @@ def test_a_replay_that_is_far_off_is_said_and_one_that_was_not_done_is_not():
     (said,) = (sentence for sentence in far.sentences() if "in one piece" in sentence)
     for number in ("165 x", "4.2e+03 x", "0.25 s"):
         assert number in said
+    assert far.headline == f"{diagnosis().headline}, over short windows"
     for other in (replace(far, replayed=None), replace(far, replayed=Replayed(40.0, 2.0, 0.25, False))):
         assert not any("in one piece" in sentence for sentence in other.sentences())
+        assert other.headline == diagnosis().headline
     assert diagnosis().to_json()["replayed"] is None
 
 
