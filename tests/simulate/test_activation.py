@@ -44,7 +44,8 @@ def test_activations_keep_within_their_ranges_and_others_are_zero():
 
 
 def test_an_integrator_of_a_servo_with_an_offset_begins_without_a_force():
-    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body>
+    </worldbody>
     <actuator><general joint="j" dyntype="integrator" gainprm="5" biastype="affine" biasprm="2 -10 0"/>
     <general joint="j" dyntype="integrator" gainprm="0" biastype="affine" biasprm="2 -10 0"/></actuator></mujoco>""")
     d = mujoco.MjData(m)
