@@ -108,4 +108,5 @@ def test_a_weld_counts_whole_or_not_at_all():
     <body><joint axis="0 1 0"/><geom size="0.02"/><body name="hand" pos="0.2 0 0"><joint axis="0 1 0"/>
     <geom size="0.02"/></body></body></worldbody>
     <equality><weld body1="target" body2="hand"/></equality></mujoco>""")
-    assert close_loops(m, np.zeros((1, 2)), np.array([1])) is None  # its orientation alone depends on the last joint
+    away = np.array([[0.3, 0.0]])
+    assert close_loops(m, away, np.array([1])) is None  # its orientation alone depends on the last joint
