@@ -18,9 +18,8 @@ def counted_from_first_sample(recording: Recording, cfg: ClockCheckCfg | None = 
     """Return a recording whose demonstrations begin with their first sample, with a warning that names those moved.
 
     Of those that begin later than `ClockCheckCfg.short_gap`, such as logs with the uptime of a computer: a simulation
-    would run without commands and measurements until then. They come before `validate`, which refuses clocks of which
-    the first sample is far from 0, and what is no time at all. Where a demonstration states its state at time 0, that is
-    when it begins, and it stays.
+    would run without commands and measurements until then. Where a demonstration states its state at time 0, that is
+    when it begins, and it stays. What is no time in seconds stays too: this comes before `validate`, which refuses it.
 
     Args:
         recording: The recording, which need not be valid.
