@@ -75,8 +75,8 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
         where = f"{path}, line {line}"
         if len(cells) != len(header):
             raise RecordingError("wrong number of columns", where=where, expected=len(header), found=len(cells))
+        text = cells[clock].strip()
         try:
-            text = cells[clock].strip()
             times.append(float(text) * scale if scale else seconds(text))
         except ValueError:
             raise _not_a_number("a time", where, text) from None
