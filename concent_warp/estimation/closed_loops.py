@@ -27,6 +27,8 @@ class ClosedLoopCfg:
     max_residual: float = 0.01
     """Root mean square of the constraints' residuals above which a loop does not close [m or rad]: far more than noise
     of the measured joints opens it by."""
+    max_rate: Positive = 250.0
+    """Highest rate at which loops are solved [Hz]: the motion in between is smooth, and a solution takes 0.3 ms."""
     min_singular: Positive = 1e-3
     """Smallest singular value of the constraints' derivatives that determine the joints [-]."""
 
@@ -34,7 +36,7 @@ class ClosedLoopCfg:
 def close_loops(
     m: mujoco.MjModel, qpos: np.ndarray, dofs: np.ndarray, cfg: ClosedLoopCfg | None = None
 ) -> np.ndarray | None:
-    """Return positions at T times in which the equality constraints hold, shape (T, nq).
+    """Return positions at T times in which the equality constraints on some joints hold, shape (T, nq).
 
     Args:
         m: The compiled scene.
@@ -72,9 +74,15 @@ def close_loops(
 def _constraints(
     m: mujoco.MjModel, d: mujoco.MjData, qpos: np.ndarray, dofs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals of the equality constraints, shape (C,), and their derivatives by some joints, (C, U)."""
+    """Return the residuals of the equality constraints on some joints, shape (C,), and their derivatives, (C, U).
+
+    Others, such as those of a mocap body to a hand or of a grasped object, say nothing of these joints.
+    """
     d.qpos[:] = qpos
     mujoco.mj_fwdPosition(m, d)
     rows = d.efc_type[: d.nefc] == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
     jacobian = d.efc_J.reshape(-1, m.nv)[: d.nefc]
-    return d.efc_pos[: d.nefc][rows], jacobian[rows][:, dofs]
+    slope = jacobian[rows][:, dofs]
+    of = d.efc_id[: d.nefc][rows]
+    on_joints = np.isin(of, of[slope.any(axis=1)])
+    return d.efc_pos[: d.nefc][rows][on_joints], slope[on_joints]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.closed_loops import close_loops
+from concent_warp.estimation.closed_loops import ClosedLoopCfg, close_loops
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sample_values_and_rates
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
@@ -183,6 +184,9 @@ def _closed_by_loops(
     if not (m.eq_type < int(mujoco.mjtEq.mjEQ_JOINT)).any():  # neither connect nor weld
         return {}
     time = max((signal.time for signal in known.readings), key=len)
+    if len(time) > 1:
+        rate = 1 / float(np.median(np.diff(time)))
+        time = time[:: max(math.ceil(rate / ClosedLoopCfg.max_rate - 1e-6), 1)]
     qpos = np.tile(m.qpos0 if demonstration.qpos is None else demonstration.qpos, (len(time), 1))
     qpos[:, known.qpos[~loose]] = known.estimate(time).value[:, ~loose]
     closed = close_loops(m, qpos, known.dof[loose])

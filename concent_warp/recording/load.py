@@ -13,7 +13,6 @@ from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.still_bodies import warn_of_still_bodies
-from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.unwind import unwound
 
 KINDS = (
@@ -42,7 +41,7 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    recording = unwound(counted_from_first_sample(_read(Path(path))))
+    recording = unwound(_read(Path(path)))
     warn_of_still_bodies(recording)
     return recording
 

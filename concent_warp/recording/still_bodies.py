@@ -32,7 +32,7 @@ def warn_of_still_bodies(recording: Recording, cfg: StillBodyCfg | None = None) 
         cfg: Thresholds.
     """
     cfg, m = cfg or StillBodyCfg(), Scene(recording.scene, recording.source).model
-    found: dict[str, str] = {}
+    found: dict[str, tuple[str, str]] = {}
     for d in recording.demonstrations:
         for name, channel in d.measured.items():
             row = m.sensor(name).id
@@ -41,9 +41,9 @@ def warn_of_still_bodies(recording: Recording, cfg: StillBodyCfg | None = None) 
                 continue
             mocap = m.body_mocapid[m.body_rootid[frame.body]] >= 0
             body = m.body(frame.body).name or f"body{frame.body}"
-            found[name] = f"{body}, a mocap body," if mocap else body
-    for name, body in found.items():
-        why = "simulations leave it where the scene has it" if "mocap" in body else "it has no joint"
+            still = (f"{body}, a mocap body,", "simulations leave it where the scene has it")
+            found[name] = still if mocap else (body, "it has no joint")
+    for name, (body, why) in found.items():
         warnings.warn(
             printable(
                 f"{recording.source}: measured/{name} moves, but {body} cannot: {why}; give it the joints by which it"

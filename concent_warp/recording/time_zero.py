@@ -6,7 +6,10 @@ import warnings
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from concent_warp.errors import printable
+from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.recording.validation.cfg import ClockCheckCfg
 
@@ -16,16 +19,16 @@ def counted_from_first_sample(recording: Recording, cfg: ClockCheckCfg | None = 
 
     Of those that begin later than `ClockCheckCfg.short_gap`, such as logs with the uptime of a computer: a simulation
     would run without commands and measurements until then. Where a demonstration states its state at time 0, that is
-    when it begins, and it stays.
+    when it begins, and it stays. What is no time in seconds stays too: this comes before `validate`, which refuses it.
 
     Args:
-        recording: The recording, valid.
+        recording: The recording, which need not be valid.
         cfg: Thresholds.
     """
     cfg = cfg or ClockCheckCfg()
     demonstrations, moved = [], {}
     for d in recording.demonstrations:
-        first = min((float(stream.time[0]) for stream in _streams(d)), default=0.0)
+        first = _first(d)
         if first > cfg.short_gap and d.qpos is None and d.qvel is None:
             moved[d.name] = first
             d = _earlier(d, first)
@@ -35,6 +38,13 @@ def counted_from_first_sample(recording: Recording, cfg: ClockCheckCfg | None = 
     named = ", ".join(f"{name} from {first:.6g} s" for name, first in moved.items())
     warnings.warn(printable(f"{recording.source}: times are counted from the first sample: {named} on"), stacklevel=2)
     return replace(recording, demonstrations=tuple(demonstrations))
+
+
+def _first(d: Demonstration) -> float:
+    """Return the time of the first sample of all [s]; 0 where there is none, or what is no time in seconds."""
+    times = [np.asarray(stream.time) for stream in _streams(d)]
+    usable = all(t.ndim == 1 and len(t) and t.dtype.kind in "fiu" and 0 <= t[0] <= MAX_MAGNITUDE for t in times)
+    return min(float(t[0]) for t in times) if times and usable else 0.0
 
 
 def _streams(d: Demonstration) -> list[Any]:

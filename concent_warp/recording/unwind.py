@@ -3,7 +3,8 @@
 An absolute encoder, an arctangent or a driver that keeps angles within -pi..pi jumps by a turn where a hinge passes the
 end of that interval; the scene's angle does not. Such readings are continued over the jumps. They are known by what a
 wrapped angle cannot do: leave an interval of one turn; and by jumps of more than two thirds of a turn between samples
-next to one another, which the continued angle makes less than half as long.
+next to one another, over which the continued angle moves about as fast as beside them. Set-points that step by so much,
+and readings that drop out, stand still beside their jumps.
 """
 
 from __future__ import annotations
@@ -29,8 +30,15 @@ class UnwindCfg:
     min_jump: float = 2 / 3
     """Least jump between samples next to one another [turns]: the motion behind it is then at most half as long."""
     max_step: float = 0.25
-    """Motion between samples that 95 % of the continued angles keep below [turns]: noise that reaches round the circle
-    does not."""
+    """Motion between samples that 95 % of the continued angles that move keep below [turns]: noise that reaches round
+    the circle, and set-points at random that are held for a while, do not."""
+    max_speed_ratio: float = 3.0
+    """Highest speed of most continued angles over their jumps, over the highest beside these [-]: acceleration within a
+    few samples, and noise."""
+    beside: int = 2
+    """Steps on either side that are beside a jump, those at which the angle stands still left out [-]."""
+    small_step: float = 0.02
+    """Motion over a jump that is never too fast [turns]: an angle that rests at the end of a turn."""
     max_gap: float = 3.0
     """Longest time between such samples, in units of the median: in a longer gap the joint itself may have turned
     [-]."""
@@ -55,18 +63,23 @@ def unwound(recording: Recording, cfg: UnwindCfg | None = None) -> Recording:
     named: dict[str, None] = {}
     demonstrations = []
     for d in recording.demonstrations:
-        measured, action, first = dict(d.measured), dict(d.action), {}
+        measured, action, mended = dict(d.measured), dict(d.action), {}
         for name, channel in d.measured.items():
             joint = measured_hinge(m, name)
             if joint is not None and (value := _unwound(channel.time, channel.value[:, 0], cfg)) is not None:
                 value = _near(value, _start(m, d, joint))
-                measured[name] = replace(channel, value=value[:, None])
-                first[joint] = float(value[np.isfinite(value)][0])
+                measured[name] = mended[joint] = replace(channel, value=value[:, None])
                 named[f"measured/{name}"] = None
         for name, channel in d.action.items():
-            joint = commanded_hinge(m, name)
-            if joint is not None and (value := _unwound(channel.time, channel.value, cfg)) is not None:
-                action[name] = replace(channel, value=_near(value, first.get(joint, _measured_first(m, d, joint))))
+            if (joint := commanded_hinge(m, name)) is None:
+                continue
+            value = _unwound(channel.time, channel.value, cfg)
+            if value is not None:
+                value = _near(value, _first(mended[joint]) if joint in mended else _measured_first(m, d, joint))
+            elif joint in mended:
+                value = _beside(channel, mended[joint])
+            if value is not None:
+                action[name] = replace(channel, value=value)
                 named[f"action/{name}"] = None
         demonstrations.append(replace(d, measured=measured, action=action))
     if not named:
@@ -95,9 +108,30 @@ def wraps(time: np.ndarray, value: np.ndarray, turn: float, cfg: UnwindCfg | Non
         return False
     periods, steps = np.diff(time[known]), np.diff(value[known])
     near = periods <= cfg.max_gap * np.median(periods)
-    moved = np.abs(steps - turn * np.round(steps / turn))[near]
-    jumps = np.abs(steps)[near] > cfg.min_jump * turn
-    return bool(jumps.any() and np.quantile(moved, 0.95) < cfg.max_step * turn)
+    moved = np.abs(steps - turn * np.round(steps / turn))
+    jumps = near & (np.abs(steps) > cfg.min_jump * turn)
+    moving = near & (moved > 0)
+    if not jumps.any() or (moving.any() and np.quantile(moved[moving], 0.95) >= cfg.max_step * turn):
+        return False
+    fastest = cfg.max_speed_ratio * _speed_beside(periods, moved, jumps, moving & ~jumps, cfg.beside)
+    return bool(np.mean(moved[jumps] <= np.maximum(fastest * periods[jumps], cfg.small_step * turn)) > 0.5)
+
+
+def _speed_beside(
+    periods: np.ndarray, moved: np.ndarray, jumps: np.ndarray, others: np.ndarray, count: int
+) -> np.ndarray:
+    """Return the highest speed in the steps next to each of J jumps, shape (J,); 0 without any.
+
+    Args:
+        periods: Durations of S steps [s], shape (S,).
+        moved: Motion of each, shape (S,).
+        jumps: Which are jumps, shape (S,) bool.
+        others: Which are looked at, shape (S,) bool.
+        count: How many on either side.
+    """
+    speed = np.pad(moved[others] / periods[others], count)
+    place = np.searchsorted(np.flatnonzero(others), np.flatnonzero(jumps))
+    return speed[place[:, None] + np.arange(2 * count)].max(axis=1)
 
 
 def continued(value: np.ndarray) -> np.ndarray:
@@ -129,6 +163,19 @@ def _near(value: np.ndarray, start: float | None) -> np.ndarray:
     if start is None:
         return value
     return value - TURN * np.round((value[np.isfinite(value)][0] - start) / TURN)
+
+
+def _beside(command: Channel, measured: Channel) -> np.ndarray | None:
+    """Return commands [rad], shape (T,), moved by the turns that they are from what was measured most of the time.
+
+    None where they are not: a command may be beyond the end of a turn all the time, and jump nowhere.
+    """
+    value, row = measured.value[:, 0], np.searchsorted(command.time, measured.time, side="right") - 1
+    known = np.isfinite(value) & (row >= 0)
+    if not known.any():
+        return None
+    turns = np.round(np.median(command.value[row[known]] - value[known]) / TURN)
+    return command.value - TURN * turns if turns else None
 
 
 def _turns(m: mujoco.MjModel, joint: int) -> bool:

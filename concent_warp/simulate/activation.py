@@ -17,8 +17,8 @@ FOLLOWING = (int(DYNAMICS.mjDYN_FILTER), int(DYNAMICS.mjDYN_FILTEREXACT), int(DY
 def initial_activation(m: mujoco.MjModel, d: mujoco.MjData, ctrl: np.ndarray) -> np.ndarray:
     """Return the activations at the start, shape (na,).
 
-    Filters and muscles are where the first command would hold them. An integrator that is the setpoint of a servo is at
-    the servo's position, so that it does not pull; others are zero.
+    Filters and muscles are where the first command would hold them. An integrator that is the setpoint of a servo is
+    where the servo does not pull, which is its position if its gain is its stiffness; others are zero.
 
     Args:
         m: The compiled model.
@@ -28,6 +28,7 @@ def initial_activation(m: mujoco.MjModel, d: mujoco.MjData, ctrl: np.ndarray) ->
     act = np.zeros(m.na)
     if not m.na:
         return act
+    clipped = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
     mujoco.mj_kinematics(m, d)
     mujoco.mj_comPos(m, d)
     mujoco.mj_tendon(m, d)
@@ -37,12 +38,14 @@ def initial_activation(m: mujoco.MjModel, d: mujoco.MjData, ctrl: np.ndarray) ->
         kind = int(m.actuator_dyntype[i])
         if kind in FOLLOWING:
             command = float(ctrl[i])
-            act[last] = np.clip(command, *m.actuator_ctrlrange[i]) if m.actuator_ctrllimited[i] else command
+            limited = clipped and m.actuator_ctrllimited[i]
+            act[last] = np.clip(command, *m.actuator_ctrlrange[i]) if limited else command
             if kind == int(DYNAMICS.mjDYN_MUSCLE):
                 act[last] = np.clip(act[last], 0.0, 1.0)
         elif kind == int(DYNAMICS.mjDYN_INTEGRATOR):
-            servo = m.actuator_biastype[i] == BIAS.mjBIAS_AFFINE and m.actuator_biasprm[i, 1] != 0
-            act[last] = d.actuator_length[i] if servo else 0.0
+            gain, (offset, slope) = m.actuator_gainprm[i, 0], m.actuator_biasprm[i, :2]
+            servo = m.actuator_biastype[i] == BIAS.mjBIAS_AFFINE and slope != 0 and gain != 0
+            act[last] = -(offset + slope * d.actuator_length[i]) / gain if servo else 0.0
         if m.actuator_actlimited[i]:
             act[last] = np.clip(act[last], *m.actuator_actrange[i])
     return act

@@ -1,10 +1,13 @@
 """Joints of linkages that follow from others by the loop that they close."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
+from concent_warp.estimation import joint_signals
 from concent_warp.estimation.closed_loops import close_loops
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.model import Model
@@ -66,3 +69,45 @@ def test_a_loop_that_cannot_be_closed_is_no_answer():
     away = np.array([[0.0, 0.0, 0.0]])
     assert close_loops(m, away, np.array([1, 2])) == pytest.approx(away, abs=1e-6)
     assert close_loops(m, np.array([[0.0, 0.0, 2.0]]), np.array([1])) is None
+
+
+def test_constraints_that_do_not_depend_on_the_linkage_do_not_matter():
+    elsewhere = LOOP + '<weld body1="object" body2="crank"/><weld body1="target" body2="crank"/>'
+    xml = FOUR_BAR.format(loop=elsewhere).replace(
+        "</worldbody>",
+        '<body name="object" pos="1 0 0"><freejoint/><geom size="0.1"/></body><body name="target" mocap="true"/>'
+        "</worldbody>",
+    )
+    m, alone = mujoco.MjModel.from_xml_string(xml), turned()[0].model
+    qpos = np.tile(m.qpos0, (5, 1))
+    qpos[:, 0] = CRANK[:5]
+    found, expected = (close_loops(one, at, np.array([1, 2])) for one, at in ((m, qpos), (alone, qpos[:, :3])))
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_allclose(found[:, :3], expected, atol=1e-9)
+
+
+def test_readings_at_a_high_rate_are_closed_at_a_lower_one(monkeypatch):
+    scene, demonstration = turned()
+    fine = np.arange(0, 2, 0.001)
+    channel = Channel(fine, np.interp(fine, TIME, CRANK)[:, None])
+    times = []
+
+    def counted(m, qpos, dofs, cfg=None):
+        times.append(len(qpos))
+        return close_loops(m, qpos, dofs, cfg)
+
+    monkeypatch.setattr(joint_signals, "close_loops", counted)
+    estimator = StateEstimator.of(Model(scene), replace(demonstration, measured={"encoder": channel}))
+    assert times == [500]
+    for qpos in estimator.states(fine[20:-20:200]).qpos:
+        assert gap(scene.model, qpos) < 2e-4
+
+
+def test_a_weld_counts_whole_or_not_at_all():
+    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body name="target" mocap="true" pos="0 0 0.2"/>
+    <body><joint axis="0 1 0"/><geom size="0.02"/><body name="hand" pos="0.2 0 0"><joint axis="0 1 0"/>
+    <geom size="0.02"/></body></body></worldbody>
+    <equality><weld body1="target" body2="hand"/></equality></mujoco>""")
+    away = np.array([[0.3, 0.0]])
+    assert close_loops(m, away, np.array([1])) is None  # its orientation alone depends on the last joint

@@ -1,6 +1,7 @@
 """Readings that move of bodies that cannot."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,6 +32,12 @@ def test_readings_that_move_of_bodies_that_cannot_are_named():
     assert len(words) == 2
     assert "measured/target moves, but target, a mocap body, cannot: simulations leave it" in words[0]
     assert "measured/marker moves, but block cannot: it has no joint" in words[1]
+
+
+def test_a_fixed_body_is_no_mocap_body_by_its_name():
+    scene = SCENE.replace('"block"', '"mocap_base"')
+    with pytest.warns(UserWarning, match="measured/marker moves, but mocap_base cannot: it has no joint"):
+        warn_of_still_bodies(replace(recorded(0.2), scene=scene))
 
 
 def test_noise_and_drift_of_a_fixed_marker_are_no_motion():

@@ -1,5 +1,7 @@
 """Encoders that begin anew after each turn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,11 +58,53 @@ def test_angles_begin_at_the_turn_that_the_initial_state_states():
         (np.clip(np.random.default_rng(2).normal(0, 1, len(TIME)), -3, 3), TIME, ""),  # noise
         (np.where(TIME < 3, -2.5, 2.5), np.where(TIME < 3, TIME, TIME + 5), ""),  # it turned while nothing was read
         (np.where(TIME < 3, -2.5, 2.5), TIME, 'range="-3 3" limited="true"'),  # no way round
+        (np.where(TIME == 3.0, 0.0, 4.5 + 0.1 * np.sin(TIME)), TIME, ""),  # a reading that dropped out
+        (np.where(TIME < 3, 1.6 * TIME, 0.0), TIME, ""),  # put back by hand while nothing was written
     ],
 )
 def test_other_angles_stay(value, time, limits):
     recording = turning(value, time=time, limits=limits)
     assert unwound(recording) is recording
+
+
+@pytest.mark.parametrize(
+    ("command", "time"),
+    [
+        (np.where(TIME % 2 < 1, 2.4, -2.4), TIME),
+        (np.where(TIME % 2 < 1, 2.4, -2.4) + 0.02 * np.sin(9 * TIME), TIME),
+        (np.repeat(np.random.default_rng(0).uniform(-2.9, 2.9, 12), 50), TIME),
+        (np.array([2.6, -2.6]), np.array([0.0, 3.0])),
+    ],
+    ids=["square", "square and sine", "at random", "two"],
+)
+def test_set_points_that_step_stay(command, time):
+    recording = turning(0.5 * np.sin(TIME))
+    action = {"servo": Channel(time, command)}
+    recording = Recording(recording.scene, (replace(recording[0], action=action),))
+    assert unwound(recording) is recording
+
+
+def test_commands_that_are_held_between_changes_go_on():
+    held = np.repeat(ANGLE[::10], 10)  # of a policy at 10 Hz
+    with pytest.warns(UserWarning, match="action/servo"):
+        found = unwound(turning(ANGLE, command=wrapped(held)))[0]
+    np.testing.assert_allclose(found.action["servo"].value, held, atol=1e-9)
+
+
+def test_a_command_that_is_beyond_the_end_of_a_turn_all_the_time_goes_with_what_was_measured():
+    angle = 3.0 + 0.2 * np.minimum(TIME, 2.5)
+    with pytest.warns(UserWarning, match=r"jumps: measured/encoder, action/servo"):
+        found = unwound(turning(wrapped(angle), command=wrapped(angle + 0.3)))[0]
+    np.testing.assert_allclose(found.measured["encoder"].value[:, 0], angle, atol=1e-9)
+    np.testing.assert_allclose(found.action["servo"].value, angle + 0.3, atol=1e-9)
+
+
+def test_a_far_set_point_that_was_reached_stays():
+    angle = 9.0 * (1 - np.exp(-2 * TIME))
+    with pytest.warns(UserWarning, match=r"jumps: measured/encoder$"):
+        found = unwound(turning(wrapped(angle), command=np.full(len(TIME), 9.0)))[0]
+    np.testing.assert_allclose(found.measured["encoder"].value[:, 0], angle, atol=1e-9)
+    np.testing.assert_allclose(found.action["servo"].value, 9.0)
 
 
 def test_a_recording_is_unwound_on_reading_and_wrapped_degrees_are_refused(tmp_path):

@@ -41,3 +41,23 @@ def test_activations_keep_within_their_ranges_and_others_are_zero():
     np.testing.assert_allclose(
         initial_activation(m, mujoco.MjData(m), np.array([3.0, 0.4, 5.0, 0.7])), [1, 0.4, 0, 0.2]
     )
+
+
+def test_an_integrator_of_a_servo_with_an_offset_begins_without_a_force():
+    m = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body>
+    </worldbody>
+    <actuator><general joint="j" dyntype="integrator" gainprm="5" biastype="affine" biasprm="2 -10 0"/>
+    <general joint="j" dyntype="integrator" gainprm="0" biastype="affine" biasprm="2 -10 0"/></actuator></mujoco>""")
+    d = mujoco.MjData(m)
+    d.qpos[0] = 0.5
+    d.act[:] = initial_activation(m, d, np.zeros(2))
+    mujoco.mj_forward(m, d)
+    assert d.actuator_force[0] == pytest.approx(0.0)
+    assert d.act[1] == 0.0
+
+
+def test_a_command_is_not_clipped_where_the_scene_says_so():
+    m = mujoco.MjModel.from_xml_string("""<mujoco><option><flag clampctrl="disable"/></option><worldbody>
+    <body><joint name="j"/><geom size="0.1"/></body></worldbody><actuator>
+    <general joint="j" dyntype="filter" dynprm="0.1" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>""")
+    assert initial_activation(m, mujoco.MjData(m), np.array([3.0])) == pytest.approx([3.0])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 from scipy.stats import t as student
 
 from concent_warp.effects.effect import Effect, Parameter
@@ -83,7 +84,8 @@ def excludes_null(fitted: Sequence[FittedParameter], covered: np.ndarray, depend
 
     Where parameters stand in for one another, as the friction of two joints that move as one, each by itself may be
     at its null value, but not all of them. The combinations are the principal axes of the parameters' correlations,
-    those of which the data leave a small share of what they leave of the parameters one by one.
+    those of which the data leave a small share of what they leave of the parameters one by one. All together exclude
+    null values that are true as seldom as one interval does (Bonferroni).
 
     Args:
         fitted: Parameters of one effect.
@@ -100,7 +102,8 @@ def excludes_null(fitted: Sequence[FittedParameter], covered: np.ndarray, depend
     away = np.array([fitted[k].value - fitted[k].null for k in known]) / std[known]
     variance, axes = np.linalg.eigh(covered[np.ix_(known, known)] / np.outer(std[known], std[known]))
     counts = variance < dependent_share
-    reach = NORMAL_QUANTILE * np.sqrt(np.maximum(variance[counts], 0.0))
+    quantile = -ndtri(ndtr(-NORMAL_QUANTILE) / max(np.count_nonzero(counts), 1))
+    reach = quantile * np.sqrt(np.maximum(variance[counts], 0.0))
     return bool((np.abs(away @ axes[:, counts]) > np.maximum(reach, 1e-9)).any())
 
 

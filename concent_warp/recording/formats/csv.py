@@ -30,6 +30,7 @@ from concent_warp.limits import limits, raising
 from concent_warp.recording.formats.csv_columns import check_command_column, column_order
 from concent_warp.recording.naming import PREFIX, by_number, name_of
 from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
@@ -80,6 +81,7 @@ def read_csv(folder: Path) -> Recording:
     if nested and (folder / NOISE).exists():
         demonstrations = _with_noise(demonstrations, _read_noise(folder / NOISE), folder / NOISE)
     recording = Recording(scene.xml, demonstrations, str(folder))
+    recording = counted_from_first_sample(recording)
     validate(recording)
     return recording
 

@@ -19,6 +19,7 @@ from concent_warp.recording.formats.hdf5_access import CHECKSUM, SafeFile, sign
 from concent_warp.recording.formats.hdf5_heap import check_heaps
 from concent_warp.recording.naming import by_number, entry_of, name_of
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, PolicyLog, Recording
+from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
@@ -49,6 +50,7 @@ def read_hdf5(path: Path) -> Recording:
         raise RecordingError(
             "the HDF5 file is damaged", where=path, found=reason, fix="copy or record it again"
         ) from error
+    recording = counted_from_first_sample(recording)
     validate(recording)
     return recording
 

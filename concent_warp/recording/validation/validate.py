@@ -235,7 +235,7 @@ def _check_time(time: np.ndarray, place: ErrorLocation) -> None:
         if np.isfinite(time[bad]):
             found = f"{time[bad]:.4g}"
             fix = "write seconds from the start of the demonstration"
-            raise place.error("its time looks like nanoseconds", row=bad, expected="seconds", found=found, fix=fix)
+            raise place.error("its time looks like ms, us or ns", row=bad, expected="seconds", found=found, fix=fix)
         raise place.error("time is not finite", row=bad, expected="seconds", found=time[bad])
     if time[0] < 0:
         raise place.error("time is negative", row=0, expected=">= 0 s", found=f"{time[0]:g} s", fix="count from 0")

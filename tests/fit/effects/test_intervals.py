@@ -183,3 +183,14 @@ def test_parameters_that_stand_in_for_one_another_are_uncertain_one_by_one_but_n
     assert not excludes_null(absent, found, 0.1)
     limit = FittedParameter("limit", np.inf, np.inf, np.inf, "N", np.inf)
     assert not excludes_null([limit, limit], np.eye(2), 0.1)
+
+
+def test_many_dependent_parameters_of_an_absent_effect_seldom_exclude_their_null_values():
+    rng, count = np.random.default_rng(0), 6
+    covered = np.full((count, count), 0.95) + 0.05 * np.eye(count)
+    hits = np.zeros(2)
+    for values in rng.multivariate_normal(np.zeros(count), covered, size=1000):
+        fitted = [FittedParameter("a", v, v - 1.96, v + 1.96, "N", 0.0) for v in values]
+        one_by_one = any(q.excludes_null for q in fitted)
+        hits += one_by_one, not one_by_one and excludes_null(fitted, covered, 0.1)
+    assert hits[1] < 50  # of 1000, at 95 %

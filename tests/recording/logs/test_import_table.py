@@ -1,5 +1,7 @@
 """Tables of numbers, as most robots' own loggers write them."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.logs.import_log import import_log
 from concent_warp.recording.logs.readers.csv_table import table_signals
+from concent_warp.recording.logs.readers.kinds import log_sources
 from concent_warp.recording.logs.suggest import suggest_map
 
 SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-2 2"/><geom size="0.1" mass="1"/></body>
@@ -73,9 +76,46 @@ def test_the_name_of_the_times_may_state_their_unit(tmp_path, name, text):
         ("t,a\nx,2\n", "line 2: a time is not a number"),
         ("t,a\n1,2\n2,x\n", "line 3: a cell of column 'a' is not a number; found 'x'"),
         ("t,a\n", "no rows below its header"),
+        ("t;a;b\n0;1,5;2\n", "line 2: a cell of column 'a' is not a number; found '1,5'; write decimals with a point"),
+        ("t;a\n0,5;1\n", "line 2: a time is not a number; found '0,5'; write decimals with a point"),
     ],
 )
 def test_what_is_no_table_of_numbers_is_refused(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(RecordingError, match=message):
         table_signals(tmp_path / "a.csv")
+
+
+def test_columns_of_texts_are_left_out_and_empty_ones_are_missing_throughout(tmp_path):
+    (tmp_path / "a.csv").write_text("t,a,b,c\n0,1,,push\n1,,,\n")
+    found = table_signals(tmp_path / "a.csv")
+    assert list(found) == ["a", "b"]
+    np.testing.assert_array_equal(found["a"].value, [1.0, np.nan])
+    assert np.isnan(found["b"].value).all()
+
+
+def test_commands_are_known_by_their_names(tmp_path):
+    (tmp_path / "a.csv").write_text("t,action_1,q1_cmd,jointAction,reaction_force,traction\n0,1,1,1,1,1\n")
+    found = table_signals(tmp_path / "a.csv")
+    assert [name for name, signal in found.items() if signal.command] == ["action_1", "q1_cmd", "jointAction"]
+
+
+def test_a_long_table_takes_little_more_memory_than_its_numbers(tmp_path):
+    rows, columns = 5000, 20
+    text = "t," + ",".join(f"q{k}" for k in range(columns)) + "\n"
+    text += "".join(f"{row * 0.01:.2f}" + ",0.123456" * columns + "\n" for row in range(rows))
+    (tmp_path / "a.csv").write_text(text)
+    tracemalloc.start()
+    table_signals(tmp_path / "a.csv")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * 8 * rows * columns
+
+
+def test_notes_in_a_folder_of_bags_are_no_log(tmp_path):
+    for name in ("a.mcap", "b.mcap", "notes.csv"):
+        (tmp_path / name).write_text("")
+    assert [one.name for one in log_sources(tmp_path)] == ["a.mcap", "b.mcap"]
+    (tmp_path / "a.mcap").unlink()
+    (tmp_path / "b.mcap").unlink()
+    assert [one.name for one in log_sources(tmp_path)] == ["notes.csv"]

@@ -6,7 +6,9 @@ A file by itself is a log of one episode; beside images it is a part of theirs.
 from __future__ import annotations
 
 import csv
+import math
 import re
+from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,8 +18,11 @@ from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.logs.readers.log import Episode, Signal
 
-COMMANDS = ("action", "command", "cmd", "goal", "target", "setpoint", "desired")
+COMMAND = re.compile(
+    r"(?i:command|cmd|goal|target|setpoint|desired)|(?<![A-Za-z])(?i:action)|(?<=[a-z])Action"  # no reaction
+)
 """Parts of names that say that a column, or all of a table, is commanded."""
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Whole numbers above the first are since 1970 in units of the second [s]."""
 TIME = re.compile(r"(?:time|timestamp|time_?stamp|stamp|t|clock)(?:[ _]?[\[(]?(s|sec|ms|us|ns)[\])]?)?", re.IGNORECASE)
@@ -42,7 +47,7 @@ class CsvTable:
 
 
 def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
-    """Return the columns of a table but the one of times; those without any number are left out.
+    """Return the columns of a table but the one of times; those of texts are left out.
 
     Args:
         path: The file.
@@ -65,54 +70,67 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
         raise RecordingError("two columns of a table have the same name", where=f"{path}, line 1", found=twice)
     (clock, unit), *_ = clocks
     scale = UNITS.get((unit or "").lower())
-    times: list[float] = []
-    lines: list[int] = []
-    texts: list[list[str]] = []
+    times, columns = array("d"), [_Column(name) for name in header]
     for line, cells in rows:
+        where = f"{path}, line {line}"
         if len(cells) != len(header):
-            raise RecordingError(
-                "wrong number of columns", where=f"{path}, line {line}", expected=len(header), found=len(cells)
-            )
+            raise RecordingError("wrong number of columns", where=where, expected=len(header), found=len(cells))
+        text = cells[clock].strip()
         try:
-            text = cells[clock].strip()
             times.append(float(text) * scale if scale else seconds(text))
-        except ValueError as error:
-            raise RecordingError("a time is not a number", where=f"{path}, line {line}", found=str(error)) from None
-        lines.append(line)
-        texts.append(cells)
-    if not texts:
+        except ValueError:
+            raise _not_a_number("a time", where, text) from None
+        for column, cell in zip(columns, cells, strict=True):
+            column.append(line, cell.strip())
+    if not times:
         raise RecordingError("a table has no rows below its header", where=path)
     found, stamps = {}, np.array(times)
-    for k, name in enumerate(header):
-        if k != clock and (values := _column(path, name, lines, [row[k] for row in texts])) is not None:
-            command = any(word in f"{folder}{name}".lower() for word in COMMANDS)
-            found[folder + name] = Signal(folder + name, stamps, values, command=command)
+    for k, column in enumerate(columns):
+        if k != clock and (values := column.numbers(path)) is not None:
+            name = folder + column.name
+            found[name] = Signal(name, stamps, values, command=COMMAND.search(name) is not None)
     return found
 
 
-def _column(path: Path, name: str, lines: Sequence[int], cells: Sequence[str]) -> np.ndarray | None:
-    """Return the numbers of a column, NaN where a cell is empty; None where none is a number, as in texts.
+class _Column:
+    """The cells of a column so far."""
 
-    Args:
-        path: The file, for messages.
-        name: Name of the column.
-        lines: Line of each cell.
-        cells: Its cells.
+    def __init__(self, name: str) -> None:
+        """Begin without any cell."""
+        self.name = name
+        self._values = array("d")
+        self._text: tuple[int, str] | None = None
 
-    Raises:
-        RecordingError: Some cells are numbers and some are not.
-    """
-    values, wrong = np.full(len(cells), np.nan), -1
-    for row, cell in enumerate(cells):
-        text = cell.strip()
+    def append(self, line: int, text: str) -> None:
+        """Add the cell of a line."""
         try:
-            values[row] = float(text) if text else np.nan
+            self._values.append(float(text) if text else math.nan)
         except ValueError:
-            wrong = row if wrong < 0 else wrong
-    if wrong >= 0 and np.isfinite(values).any():
-        where, found = f"{path}, line {lines[wrong]}", repr(cells[wrong][:40])
-        raise RecordingError(f"a cell of column {name!r} is not a number", where=where, found=found)
-    return values if wrong < 0 else None
+            self._values.append(math.nan)
+            self._text = self._text or (line, text)
+
+    def numbers(self, path: Path) -> np.ndarray | None:
+        """Return the numbers, NaN where a cell is empty, shape (T,); None for a column of texts.
+
+        Args:
+            path: The file, for messages.
+
+        Raises:
+            RecordingError: Some cells are numbers and some are not, or all have a decimal comma.
+        """
+        values = np.array(self._values)
+        if self._text is None:
+            return values
+        line, text = self._text
+        if np.isfinite(values).any() or DECIMAL_COMMA.fullmatch(text):
+            raise _not_a_number(f"a cell of column {self.name!r}", f"{path}, line {line}", text)
+        return None
+
+
+def _not_a_number(what: str, where: str, text: str) -> RecordingError:
+    """Return the refusal of a cell."""
+    fix = "write decimals with a point" if DECIMAL_COMMA.fullmatch(text) else None
+    return RecordingError(f"{what} is not a number", where=where, found=repr(text[:40]), fix=fix)
 
 
 def seconds(text: str) -> float:

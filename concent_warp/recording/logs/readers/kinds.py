@@ -43,6 +43,8 @@ def log_kind(path: Path) -> LogKind | None:
 def log_sources(source: Path | str | Sequence[Path | str]) -> list[Path]:
     """Return the logs that are meant: a folder that is no log stands for the logs in it, in the order of their names.
 
+    Tables beside logs of another kind are notes on these, and left out.
+
     Raises:
         RecordingError: None is named, or one is named twice.
     """
@@ -50,7 +52,8 @@ def log_sources(source: Path | str | Sequence[Path | str]) -> list[Path]:
     found: list[Path] = []
     for path in named:
         inside = sorted(path.iterdir()) if path.is_dir() and log_kind(path) is None else []
-        found += [one for one in inside if log_kind(one) is not None] or [path]
+        kinds = {one: kind for one in inside if (kind := log_kind(one)) is not None}
+        found += [one for one, kind in kinds.items() if kind != "table"] or list(kinds) or [path]
     if not found:
         raise RecordingError("no log is named", expected=KINDS)
     resolved = [path.resolve() for path in found]
