@@ -230,8 +230,8 @@ class DistilCfg:
     seed: int = 0
     """Seed of all random numbers."""
     checkpoint: Positive = 600.0
-    """Time between checkpoints [s]; one is also written at the end and on interruption. Where writing one takes longer
-    than a tenth of this time, as tens of gigabytes of samples may, the time is ten times as long as that."""
+    """Time between checkpoints [s], at least ten times that of writing one; one is also written at the end and on
+    interruption."""
     states: Count | None = None
     """Initial states of the episodes; as many as in the teacher's training by default."""
     free: Share = 0.5
