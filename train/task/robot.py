@@ -58,13 +58,13 @@ class Robot:
                 hinge or slide joint as its command, or those of the gripper cannot share one number.
         """
         names = [m.actuator(i).name for i in range(m.nu)]
-        if cfg.gripper_actuators != ActionCfg.gripper_actuators:
-            if missing := [name for name in cfg.gripper_actuators if name not in names]:
-                raise TrainError(
-                    f"the robot has no actuator {missing[0]!r}",
-                    found=names,
-                    fix="name those of the gripper with --environment.action.gripper-actuators",
-                )
+        missing = [name for name in cfg.gripper_actuators if name not in names]
+        if missing and cfg.gripper_actuators != ActionCfg.gripper_actuators:
+            raise TrainError(
+                f"the robot has no actuator {missing[0]!r}",
+                found=names,
+                fix="name those of the gripper with --environment.action.gripper-actuators",
+            )
         gripper = [names.index(name) for name in cfg.gripper_actuators if name in names]
         actuator = [i for i in range(m.nu) if i not in gripper]
         for i in actuator:
@@ -137,6 +137,12 @@ def _gripper_step(m: mujoco.MjModel, gripper: list[int], cfg: ActionCfg) -> tupl
     steps: dict[str, tuple[float, bool]] = {}
     for i in gripper:
         name, joints = m.actuator(i).name, driven_joints(m, i)
+        if int(m.actuator_dyntype[i]) not in KEEPS_UNIT:
+            raise TrainError(
+                f"the gripper's actuator {name!r} integrates its command, or has a state of another kind",
+                expected="no dynamics, or a filter (timeconst)",
+                fix="use an actuator such as <position>",
+            )
         turns = any(int(m.jnt_type[j]) != int(mujoco.mjtJoint.mjJNT_SLIDE) for j in joints)
         if _takes_position(m, i) and not turns:
             steps[name] = cfg.gripper, True
