@@ -18,9 +18,9 @@ def robot_onsets(
 
     The links of the robot count as one. A contact with an object is a grasp if the robot's normal forces on it add up
     to less than `max_net_force_ratio` of the sum of their magnitudes, over windows, for `min_state_duration`: then they
-    press from opposite sides, or a suction cup draws the object that it presses. It begins with the first touch of that contact. Any other contact counts if it moves the
-    object by `min_displacement`, and as long as the robot has not grasped this object: touching it after its release
-    opens no stage.
+    press from opposite sides, or a suction cup draws the object that it presses. It begins with the first touch of that
+    contact. Any other contact counts if it moves the object by `min_displacement`, and as long as the robot has not
+    grasped this object: touching it after its release opens no stage.
     """
     max_gap, shortest = steps_of(cfg.max_gap, motion.timestep), steps_of(cfg.min_contact_duration, motion.timestep)
     grasp, width = steps_of(cfg.min_state_duration, motion.timestep), steps_of(cfg.window, motion.timestep)

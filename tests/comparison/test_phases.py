@@ -160,7 +160,8 @@ def test_what_a_suction_cup_holds_is_grasped():
     <body name="thing" pos="0 0 0.46"><freejoint/><geom type="box" size="0.03 0.03 0.03" mass="0.1"/></body>
   </worldbody>
   <actuator>
-    <position name="z" joint="z" kp="1000" dampratio="1"/><adhesion name="suction" body="cup" gain="20" ctrlrange="0 1"/>
+    <position name="z" joint="z" kp="1000" dampratio="1"/>
+    <adhesion name="suction" body="cup" gain="20" ctrlrange="0 1"/>
   </actuator>
 </mujoco>""")
     model = Model(scene)

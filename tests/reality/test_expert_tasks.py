@@ -104,7 +104,8 @@ def test_reality_chamfers_geoms_without_names_and_those_given_by_the_ends_of_the
   <asset><mesh name="tee_geom0_chamfered" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
   <worldbody>
     <body name="tee"><freejoint/>
-      <geom type="box" size="0.02 0.05 0.02" mass="0.1"/><geom type="box" size="0.03 0.01 0.02" pos="0.05 0 0" mass="0.1"/>
+      <geom type="box" size="0.02 0.05 0.02" mass="0.1"/>
+      <geom type="box" size="0.03 0.01 0.02" pos="0.05 0 0" mass="0.1"/>
     </body>
     <body name="rod" pos="0 0 1"><freejoint/>
       <geom type="cylinder" size="0.01" fromto="0 0 0 0.1 0 0" mass="0.1"/>

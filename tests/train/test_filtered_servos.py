@@ -15,7 +15,7 @@ XML = """
 <mujoco>
   <option timestep="0.005" gravity="0 0 0"/>
   <worldbody>
-    <body name="slider"><joint name="slide" type="slide" axis="1 0 0"/><geom size="0.02" mass="1"/><site name="tcp"/></body>
+    <body name="slider"><joint name="slide" type="slide" axis="1 0 0"/><geom size="0.02" mass="1"/></body>
   </worldbody>
   <actuator>
     <position name="slide" joint="slide" kp="500" dampratio="1" timeconst="0.1" ctrlrange="-0.25 0.5"/>

@@ -68,9 +68,7 @@ class Physics(Protocol):
     """Further state by name, for checkpoints."""
 
     def reset_commands(self, mask: torch.Tensor) -> None:
-        """Set delays, lags and filters of actuators to the steady state of the present commands in the worlds of a mask,
-        shape (N,) bool.
-        """
+        """Set delays, lags and filters to the steady state of the present commands in worlds of a mask (N,) bool."""
         ...
 
     def poses(self) -> tuple[wp.array, wp.array]:
