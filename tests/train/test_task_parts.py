@@ -152,6 +152,9 @@ def test_a_gripper_that_is_named_must_be_there():
 def test_a_missing_tool_site_is_an_error_that_names_those_there_are():
     with pytest.raises(TrainError, match=r"no tool site.*nose.*\['other', 'tcp'\].*--environment.action.tool-site"):
         Robot.of(arm(), ActionCfg(tool_site="nose"))
+    none = "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
+    with pytest.raises(TrainError, match=r"no tool site.*found \[\].*after adding it to the scene"):
+        Robot.of(mujoco.MjModel.from_xml_string(none), ActionCfg())
 
 
 FIXTURES = """

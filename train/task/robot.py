@@ -76,7 +76,8 @@ class Robot:
                 "the robot has no tool site",
                 expected=cfg.tool_site,
                 found=[m.site(i).name for i in range(m.nsite)],
-                fix="name one with --environment.action.tool-site",
+                fix="name one with --environment.action.tool-site"
+                + ("" if m.nsite else ", after adding it to the scene: <site> in the body of the hand"),
             )
         joint = m.actuator_trnid[actuator, 0].astype(int)
         turning = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
