@@ -48,12 +48,16 @@ class ActionCfg:
     """Largest step of a slide joint's command [m]."""
     gripper: Positive = 0.003
     """Largest step of the gripper's command [m]: so small that exploration does not drop a grasped object at once."""
+    gripper_share: Share = 0.075
+    """The same of a gripper whose command is no length, such as suction, turning fingers or 0 to 255: a share of its
+    ctrlrange."""
     turn_lead: Positive = 0.03
     """Largest difference of command and position of a hinge joint [rad]; times the stiffness it bounds the torque."""
     slide_lead: Positive = 0.015
     """Largest difference of command and position of a slide joint [m]; times the stiffness it bounds the force."""
     gripper_actuators: tuple[str, ...] = ("gripper",)
-    """Actuators that open and close the gripper with one number; names that the scene lacks are ignored."""
+    """Actuators that open and close the gripper, or switch suction, with one number; a scene without the default has no
+    gripper."""
     tool_site: str = "tcp"
     """Site between the fingertips: the end-effector."""
 

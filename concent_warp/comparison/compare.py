@@ -21,7 +21,7 @@ from concent_warp.errors import EventsError, ModelError, RecordingError
 from concent_warp.events.extract_events import extract_events
 from concent_warp.files import write_json
 from concent_warp.model import Model
-from concent_warp.simulate.replay import replay
+from concent_warp.simulate.replay import commands, replay
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
@@ -185,7 +185,8 @@ def compare_replays(
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])
             if name == last:
                 partners[d.name] = ContactPartners.of_replay(model, compiled, rollout)
-                moving[d.name] = phases_by_body(model, compiled, rollout, motion_cfg)
+                ctrl = commands(compiled, d, len(rollout.step) - 1)
+                moving[d.name] = phases_by_body(model, compiled, rollout, motion_cfg, ctrl)
             if progress is not None:
                 progress(len(found) / (len(models) * len(chosen)))
     if not any(found.values()):

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from concent_warp.checks import PositiveDuration, Share
+from concent_warp.events.adhesion import adhesion_pull
 from concent_warp.events.filter import drop_short_contacts, steps_of, true_runs, window_sums
 from concent_warp.events.grasp import forces_cancel
 from concent_warp.events.roles import Roles
@@ -115,7 +116,11 @@ def has_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
 
 
 def phases_by_body(
-    model: Model, compiled: mujoco.MjModel, rollout: Rollout, cfg: MotionPhaseCfg | None = None
+    model: Model,
+    compiled: mujoco.MjModel,
+    rollout: Rollout,
+    cfg: MotionPhaseCfg | None = None,
+    ctrl: np.ndarray | None = None,
 ) -> dict[str | None, tuple[Phase, ...]]:
     """Return the phases of motion over a replay, without gaps: of each object, or of each moving body where there is no
     object, and under None of all of them together.
@@ -125,6 +130,7 @@ def phases_by_body(
         compiled: The same as the engine compiled it.
         rollout: One variant, NumPy, all steps and bodies recorded, contacts "all".
         cfg: Settings.
+        ctrl: Commands, shape (K, nu), of which those of suction cups say when they hold an object; none by default.
     """
     cfg = cfg or MotionPhaseCfg()
     steps = len(rollout.step) - 1
@@ -132,7 +138,8 @@ def phases_by_body(
         return {None: (Phase(FREE, -np.inf, np.inf),)}
     roles = Roles.of(compiled, model)
     motion = BodyPoses.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
-    touches = ReplayContacts.of(rollout.contacts, roles)
+    pull = None if ctrl is None else adhesion_pull(compiled, rollout.contacts, ctrl)
+    touches = ReplayContacts.of(rollout.contacts, roles, pull=pull)
     movable = np.flatnonzero(compiled.body_weldid != 0)
     watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
     speeds = Speeds.of(motion, compiled)

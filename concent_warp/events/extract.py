@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.errors import EventsError
+from concent_warp.events.adhesion import adhesion_pull
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.filter import close_gaps, steps_of, true_runs
 from concent_warp.events.roles import Roles
@@ -14,7 +15,7 @@ from concent_warp.events.sequence import ContactEventSequence, ContactInterval
 from concent_warp.events.staging import find_stages
 from concent_warp.events.target import rounded_direction, rounded_number, rounded_vector
 from concent_warp.events.touches import BodyPoses, ReplayContacts
-from concent_warp.simulate.replay import replay, step_count
+from concent_warp.simulate.replay import commands, replay, step_count
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
@@ -47,7 +48,8 @@ def extract(
     roles = Roles.of(engine.compiled, model)
     steps = step_count(demonstration, engine.timestep)
     motion = BodyPoses.of(rollout, roles.bodies, engine.timestep, steps)
-    return _from_log(rollout.contacts, roles, motion, model.geometry, name=demonstration.name, cfg=cfg)
+    pull = adhesion_pull(engine.compiled, rollout.contacts, commands(engine.compiled, demonstration, steps))
+    return _from_log(rollout.contacts, roles, motion, model.geometry, name=demonstration.name, cfg=cfg, pull=pull)
 
 
 def _from_log(
@@ -59,6 +61,7 @@ def _from_log(
     name: str = "",
     cfg: StagingCfg | None = None,
     variant: int = 0,
+    pull: np.ndarray | None = None,
 ) -> ContactEventSequence:
     """Return the contact event sequence of one variant of a rollout.
 
@@ -70,9 +73,10 @@ def _from_log(
         name: Name of the demonstration.
         cfg: Settings of the filter and of the staging.
         variant: Which variant of the log.
+        pull: Force of adhesion on each contact of the log [N], shape (C,); none by default.
     """
     cfg = cfg or StagingCfg()
-    everything = ReplayContacts.of(log, roles, variant)
+    everything = ReplayContacts.of(log, roles, variant, pull)
     in_contact = everything.debounced_pairs(motion.steps, motion.timestep, cfg)
     touches = everything.within(in_contact)
     used = sorted({int(i) for i in touches.entity.ravel()}, key=lambda i: roles.entities[i].name)

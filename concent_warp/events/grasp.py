@@ -18,9 +18,9 @@ def robot_onsets(
 
     The links of the robot count as one. A contact with an object is a grasp if the robot's normal forces on it add up
     to less than `max_net_force_ratio` of the sum of their magnitudes, over windows, for `min_state_duration`: then they
-    press from opposite sides. It begins with the first touch of that contact. Any other contact counts if it moves the
-    object by `min_displacement`, and as long as the robot has not grasped this object: touching it after its release
-    opens no stage.
+    press from opposite sides, or a suction cup draws the object that it presses. It begins with the first touch of that
+    contact. Any other contact counts if it moves the object by `min_displacement`, and as long as the robot has not
+    grasped this object: touching it after its release opens no stage.
     """
     max_gap, shortest = steps_of(cfg.max_gap, motion.timestep), steps_of(cfg.min_contact_duration, motion.timestep)
     grasp, width = steps_of(cfg.min_state_duration, motion.timestep), steps_of(cfg.window, motion.timestep)
@@ -50,8 +50,12 @@ def robot_onsets(
 
 
 def forces_cancel(rows: ReplayContacts, steps: int, width: int, share: float) -> np.ndarray:
-    """Return when normal forces cancel to less than `share` of their sum, over windows of `width` steps, shape (K,)."""
+    """Return when normal forces cancel to less than `share` of their sum, over windows of `width` steps, shape (K,).
+
+    Adhesion is a force against the pressure of its contact.
+    """
     total = np.zeros((steps, 4))
-    np.add.at(total, rows.step, np.concatenate([rows.force[:, None] * rows.normal, rows.force[:, None]], axis=1))
+    net = (rows.force - rows.pull)[:, None] * rows.normal
+    np.add.at(total, rows.step, np.concatenate([net, (rows.force + rows.pull)[:, None]], axis=1))
     total = window_sums(total, width)
     return np.linalg.norm(total[:, :3], axis=1) < share * total[:, 3]

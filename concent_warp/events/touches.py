@@ -74,13 +74,22 @@ class ReplayContacts:
     """Unit normal from b to a, world frame, shape (C, 3)."""
     force: np.ndarray
     """Normal force [N], shape (C,)."""
+    pull: np.ndarray
+    """Force of adhesion that draws the two together [N], shape (C,)."""
 
     def __getitem__(self, rows: np.ndarray) -> ReplayContacts:
         return ReplayContacts(**{name: value[rows] for name, value in vars(self).items()})
 
     @staticmethod
-    def of(log: ContactLog, roles: Roles, variant: int = 0) -> ReplayContacts:
-        """Order the contacts of one variant; contacts within the robot are left out."""
+    def of(log: ContactLog, roles: Roles, variant: int = 0, pull: np.ndarray | None = None) -> ReplayContacts:
+        """Order the contacts of one variant; contacts within the robot are left out.
+
+        Args:
+            log: Every contact of every step.
+            roles: Names and roles of what the log's geom ids mean.
+            variant: Which variant of the log.
+            pull: Force of adhesion on each contact of the log [N], shape (C,); none by default.
+        """
         kept = log.variant == variant
         geom, normal = log.geom[kept], np.asarray(log.normal[kept], dtype=float)
         if geom.size and geom.max() >= len(roles.geom_body):
@@ -103,6 +112,7 @@ class ReplayContacts:
             point=np.asarray(log.position[kept], dtype=float),
             normal=np.where(swap[:, None], normal, -normal),
             force=force,
+            pull=np.zeros(len(force)) if pull is None else pull[kept],
         )
         return touches[(role != ROLE_ORDER["robot"]).any(axis=1) & (body[:, 0] != body[:, 1])]
 

@@ -73,15 +73,22 @@ class WorldCfg:
 
     def chamfer_geom(self, spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
         """Replace a box or a cylinder by a convex mesh with chamfered edges, with the mass and inertia it had."""
-        name = f"{geom.name}_chamfered"
         body = geom.parent
+        place = [other is geom or other == geom for other in body.geoms].index(True)
+        taken = {mesh.name for mesh in spec.meshes}
+        name = f"{geom.name or f'{body.name}_geom{place}'}_chamfered"
+        while name in taken:
+            name += "_"
         compiled = spec.copy().compile()
         base = compiled.body(body.name).id
+        row = int(compiled.body_geomadr[base]) + place
         body.explicitinertial = True
         body.mass, body.inertia = compiled.body_mass[base], compiled.body_inertia[base]
         body.ipos, body.iquat = compiled.body_ipos[base], compiled.body_iquat[base]
         mesh = spec.add_mesh(name=name)
-        mesh.uservert = CHAMFERED[geom.type](np.array(geom.size), self.chamfer).ravel()
+        # The compiled geom has the pose and the size that the MJCF may state by the ends of its axis.
+        geom.pos, geom.quat, geom.fromto = compiled.geom_pos[row], compiled.geom_quat[row], [np.nan] * 6
+        mesh.uservert = CHAMFERED[geom.type](compiled.geom_size[row].copy(), self.chamfer).ravel()
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
 
 

@@ -9,7 +9,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.simulate.replay import replay
+from concent_warp.simulate.replay import commands, replay
 
 FLOOR = """
 <mujoco>
@@ -148,3 +148,29 @@ def test_two_objects_have_separate_phases_and_the_faster_one_gives_those_of_the_
     assert set(found) == {None, "thing", "other"}
     assert names(found["thing"])[:2] == names(found[None])[:2] == ["free", "impact"]
     assert names(found["other"])[-1] == "rest"
+
+
+def test_what_a_suction_cup_holds_is_grasped():
+    scene = Scene("""
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="cup" pos="0 0 0.5" gravcomp="1"><joint name="z" type="slide" axis="0 0 1"/>
+      <geom type="box" size="0.02 0.02 0.01" mass="1"/></body>
+    <body name="thing" pos="0 0 0.46"><freejoint/><geom type="box" size="0.03 0.03 0.03" mass="0.1"/></body>
+  </worldbody>
+  <actuator>
+    <position name="z" joint="z" kp="1000" dampratio="1"/>
+    <adhesion name="suction" body="cup" gain="20" ctrlrange="0 1"/>
+  </actuator>
+</mujoco>""")
+    model = Model(scene)
+    engine = MujocoEngine(model)
+    time = np.linspace(0, 1, 50)
+    action = {"z": Channel(time, 0.2 * time), "suction": Channel(time, np.ones(50))}
+    demonstration = Demonstration("d", qpos=scene.model.qpos0, action=action)
+    rollout = replay(model, demonstration, engine, contacts="all").numpy()
+    ctrl = commands(engine.compiled, demonstration, len(rollout.step) - 1)
+    found = phases_by_body(model, engine.compiled, rollout, ctrl=ctrl)["thing"]
+    assert "grasped" in names(found)
+    assert "grasped" not in names(phases_by_body(model, engine.compiled, rollout)["thing"])

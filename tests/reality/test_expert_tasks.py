@@ -98,6 +98,30 @@ def test_reality_has_a_chamfered_peg_of_the_same_mass():
     np.testing.assert_allclose(height[radius < 0.014], 0.025)
 
 
+def test_reality_chamfers_geoms_without_names_and_those_given_by_the_ends_of_their_axis():
+    scene = Scene("""
+<mujoco>
+  <asset><mesh name="tee_geom0_chamfered" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+  <worldbody>
+    <body name="tee"><freejoint/>
+      <geom type="box" size="0.02 0.05 0.02" mass="0.1"/>
+      <geom type="box" size="0.03 0.01 0.02" pos="0.05 0 0" mass="0.1"/>
+    </body>
+    <body name="rod" pos="0 0 1"><freejoint/>
+      <geom type="cylinder" size="0.01" fromto="0 0 0 0.1 0 0" mass="0.1"/>
+    </body>
+  </worldbody>
+</mujoco>""")
+    nominal, world = scene.model, WorldCfg(chamfer=0.002).build(scene).compile()
+    assert (world.geom_type == mujoco.mjtGeom.mjGEOM_MESH).all()
+    for m in (nominal, world):
+        d = mujoco.MjData(m)
+        mujoco.mj_forward(m, d)
+        np.testing.assert_allclose(d.geom_xpos, [[0, 0, 0], [0.05, 0, 0], [0.05, 0, 1]], atol=1e-6)
+    corners = world.mesh_vert[world.mesh_vertadr[world.geom_dataid[2]] :]
+    assert np.ptp(corners, axis=0).max() == pytest.approx(0.1, abs=1e-5)
+
+
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_scene_states_the_goal(task):
     np.testing.assert_allclose(task.build().goal(), task.goal())

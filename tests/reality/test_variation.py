@@ -144,3 +144,21 @@ def test_recording_varies_and_all_else_stays():
 def test_ranges_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ConcentError, match="out of bounds"):
         check_settings(VariationCfg(**wrong))
+
+
+def test_pads_are_those_of_suction_cups_and_of_fingers_that_an_equality_holds():
+    model = mujoco.MjModel.from_xml_string("""
+<mujoco>
+  <worldbody>
+    <body><joint name="free" type="slide"/><geom name="other" size="0.1"/></body>
+    <body name="a"><joint name="a" type="slide"/><geom name="finger" size="0.1"/><geom size="0.1"/></body>
+    <body name="b"><geom name="fixed" size="0.1"/></body>
+    <body name="cup"><geom name="lip" size="0.1"/></body>
+    <body name="last"><joint name="last" type="slide"/><geom name="last" size="0.1"/></body>
+  </worldbody>
+  <equality><joint joint1="a"/></equality>
+  <actuator><position name="grip" joint="a"/><adhesion name="suction" body="cup" ctrlrange="0 1"/></actuator>
+</mujoco>""")
+    assert pad_geoms(model, ["suction"]) == ("lip",)
+    assert pad_geoms(model, ["grip"]) == ("finger",)
+    assert pad_geoms(model, ["grip", "suction", "none"]) == ("finger", "lip")

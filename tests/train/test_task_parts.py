@@ -99,12 +99,62 @@ def test_actuators_of_the_arm_drive_single_joints(drives):
     )
     with pytest.raises(TrainError, match=r"'wrong' drives no hinge or slide joint.*gripper-actuators"):
         Robot.of(arm(PLAIN + other), ActionCfg())
-    assert len(Robot.of(arm(PLAIN + other), ActionCfg(gripper_actuators=("none", "turn", "wrong"))).joint) == 1
+
+
+OTHER_COMMANDS = {
+    "motor": '<motor name="turn" joint="turn" ctrlrange="-1 1"/>',
+    "velocity": '<velocity name="turn" joint="turn" kv="3"/>',
+    "intvelocity": '<intvelocity name="turn" joint="turn" kp="3" actrange="-1 1"/>',
+    "damper": '<damper name="turn" joint="turn" kv="3" ctrlrange="0 1"/>',
+}
+
+
+@pytest.mark.parametrize("drives", OTHER_COMMANDS.values(), ids=OTHER_COMMANDS)
+def test_commands_that_are_no_positions_are_refused_with_what_to_do(drives):
+    with pytest.raises(TrainError, match=r"command of actuator 'turn' is no position.*<position> actuators.*own_robot"):
+        Robot.of(arm(drives), ActionCfg())
+
+
+def test_servos_are_taken_in_every_notation_but_not_with_a_gear():
+    for drives in (
+        '<general name="turn" joint="turn" gainprm="20" biastype="affine" biasprm="0 -20 -1"/>',
+        '<position name="turn" jointinparent="turn" kp="20" timeconst="0.1"/>',
+        '<position name="turn" joint="turn" kp="20" dampratio="1"/>',
+    ):
+        assert Robot.of(arm(drives), ActionCfg()).actions == 1
+    with pytest.raises(TrainError, match=r"'turn' has a gear; expected 1, found 50.*square of the gear"):
+        Robot.of(arm('<position name="turn" joint="turn" kp="20" gear="50"/>'), ActionCfg())
+
+
+def test_grippers_that_are_no_lengths_step_by_a_share_of_their_range():
+    cup = '<adhesion name="cup" body="slider" gain="20" ctrlrange="0 2"/>'
+    cfg = ActionCfg(gripper_actuators=("cup",), gripper_share=0.25)
+    found = Robot.of(arm(PLAIN + cup), cfg)
+    assert found.step[-1] == 0.5
+    assert not found.in_metres
+    assert not found.opening.any()
+    bytes_of = '<general name="cup" tendon="fingers" ctrlrange="0 255" gainprm="0.3" biastype="affine" biasprm="0 -9"/>'
+    assert Robot.of(arm(PLAIN + bytes_of), cfg).step[-1] == 0.25 * 255
+    turning = '<position name="cup" joint="turn" ctrlrange="0 1"/>'
+    assert Robot.of(arm(turning), cfg).step.tolist() == [0.25]
+    with pytest.raises(TrainError, match=r"'cup' has no range of commands.*ctrlrange"):
+        Robot.of(arm(turning.replace('ctrlrange="0 1"', "")), cfg)
+    both = replace(cfg, gripper_actuators=("cup", "finger"))
+    with pytest.raises(TrainError, match=r"one number cannot command all.*'cup': 0.5, 'finger': 0.003"):
+        Robot.of(arm(PLAIN + cup + '<position name="finger" joint="a"/>'), both)
+
+
+def test_a_gripper_that_is_named_must_be_there():
+    with pytest.raises(TrainError, match=r"no actuator 'jaws'; found \['slide', 'turn'\].*gripper-actuators"):
+        Robot.of(arm(), ActionCfg(gripper_actuators=("slide", "jaws")))
 
 
 def test_a_missing_tool_site_is_an_error_that_names_those_there_are():
     with pytest.raises(TrainError, match=r"no tool site.*nose.*\['other', 'tcp'\].*--environment.action.tool-site"):
         Robot.of(arm(), ActionCfg(tool_site="nose"))
+    none = "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
+    with pytest.raises(TrainError, match=r"no tool site.*found \[\].*after adding it to the scene"):
+        Robot.of(mujoco.MjModel.from_xml_string(none), ActionCfg())
 
 
 FIXTURES = """

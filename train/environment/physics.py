@@ -14,6 +14,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.simulate.activation import FOLLOWING
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
 from concent_warp.train.environment.command_dynamics import CommandDynamics, CommandFilter
@@ -67,7 +68,7 @@ class Physics(Protocol):
     """Further state by name, for checkpoints."""
 
     def reset_commands(self, mask: torch.Tensor) -> None:
-        """Set delays and lags to the steady state of the present commands in the worlds of a mask, shape (N,) bool."""
+        """Set delays, lags and filters to the steady state of the present commands in worlds of a mask (N,) bool."""
         ...
 
     def poses(self) -> tuple[wp.array, wp.array]:
@@ -85,6 +86,26 @@ class Physics(Protocol):
     def kinematics(self) -> Kinematics:
         """Return kinematics of the same bodies, at the model's reference positions until others are written."""
         ...
+
+
+def fill_filters(m: mujoco.MjModel, activation: torch.Tensor, mask: torch.Tensor, ctrl: torch.Tensor) -> None:
+    """Set the filters of actuators to where their commands would hold them, in place.
+
+    Args:
+        m: The compiled model.
+        activation: States of the actuators, shape (N, na).
+        mask: Worlds, shape (N,) bool.
+        ctrl: Commands, shape (N, nu).
+    """
+    for i in np.flatnonzero(np.isin(m.actuator_dyntype, FOLLOWING)).tolist():
+        held = ctrl[:, i].clamp(*m.actuator_ctrlrange[i].tolist()) if m.actuator_ctrllimited[i] else ctrl[:, i]
+        last = int(m.actuator_actadr[i] + m.actuator_actnum[i]) - 1
+        activation[:, last] = torch.where(mask, held.to(activation.dtype), activation[:, last])
+
+
+def _with_activation(memory: dict[str, torch.Tensor], activation: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return what a checkpoint keeps, with the states of the actuators where there are any."""
+    return memory | ({"activation": activation} if activation.shape[1] else {})
 
 
 @dataclass(frozen=True)
@@ -123,7 +144,8 @@ class MujocoPhysics:
         """
         self.model, self.worlds, self.device = model, worlds, "cpu"
         self._filter = command_dynamics and CommandFilter(command_dynamics, model.opt.timestep, decimation, self.device)
-        self.memory = {} if self._filter is None else self._filter.memory
+        self.activation = torch.zeros(worlds, model.na, dtype=torch.float64)
+        self.memory = _with_activation({} if self._filter is None else self._filter.memory, self.activation)
         self._decimation, self._actors = decimation, tuple(actors) or ((),) * worlds
         self._models = [self._model_of(i, fields or {}) for i in range(worlds)]
         self._data = [mujoco.MjData(m) for m in self._models]
@@ -173,6 +195,7 @@ class MujocoPhysics:
         """See `Physics.reset_commands`."""
         if self._filter is not None:
             self._filter.reset(mask, self.ctrl)
+        fill_filters(self.model, self.activation, mask, self.ctrl)
 
     def advance(self) -> None:
         """Simulate the steps of one action; the positions of a world that MuJoCo resets as unstable become NaN."""
@@ -249,12 +272,14 @@ class MujocoPhysics:
             for target, value in zip(present, given, strict=True):
                 target[:] = value
             d.qacc_warmstart[:] = self._arrays[2][i]
+        d.act[:] = self.activation[i].numpy()
 
     def _read(self, i: int, d: mujoco.MjData) -> None:
         """Copy the data of a world to its tensors."""
         values = (d.qpos, d.qvel, d.qacc_warmstart, d.xpos, d.xquat, d.site_xpos)
         for array, value in zip(self._arrays, values, strict=True):
             array[i] = value
+        self.activation[i] = torch.from_numpy(d.act)
 
 
 class WarpPhysics:
@@ -318,7 +343,9 @@ class WarpPhysics:
             ]
             self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+            self.activation = wp.to_torch(d.act) if model.na else torch.zeros(worlds, 0, device=self.device)
             self._make_filter(command_dynamics, capture)
+            self.memory = _with_activation(self.memory, self.activation)
             self._wrench = wp.zeros_like(d.xfrc_applied) if force_models else d.xfrc_applied
             self.wrench = wp.to_torch(self._wrench)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
@@ -339,6 +366,7 @@ class WarpPhysics:
             wp.copy(d.qpos, start)
             d.qvel.zero_()
             d.qacc_warmstart.zero_()
+            self.activation.zero_()
             d.overflow.zero_()
         wp.synchronize_device(self._warp_device)
 
@@ -366,6 +394,7 @@ class WarpPhysics:
         """See `Physics.reset_commands`."""
         if self._filter is not None:
             self._filter.reset(mask, self.ctrl)
+        fill_filters(self.model, self.activation, mask, self.ctrl)
 
     def advance(self) -> None:
         """Simulate the steps of one action."""

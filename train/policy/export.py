@@ -34,6 +34,13 @@ METADATA = "concent"
 """Key of the metadata in ONNX; in TorchScript it is the extra file of this name with ``.json``."""
 INPUT, OUTPUT = "observation", "action"
 OPSET = 18
+COMMAND_UNIT = "that of its ctrlrange"
+"""Unit of the command of a gripper that is no length, such as suction."""
+MEANING = {
+    True: "above 0 raises their commands and opens, below 0 closes",
+    False: "above 0 raises their commands, below 0 lowers them",
+}
+"""Meaning of the gripper's action, by whether its command is a length."""
 PACKAGES = ("concent-warp", "torch", "onnx", "rsl-rl-lib", "mujoco", "mujoco-warp")
 SUFFIXES = (".onnx", ".pt")
 
@@ -157,6 +164,7 @@ def describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
 def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     """Return names, order and meaning of the parts of the observation."""
     m, robot = task.compiled, task.robot
+    unit = "m" if robot.in_metres else COMMAND_UNIT
     joints = [m.joint(j).name for j in robot.joint]
     hinges = [name for name, turning in zip(joints, robot.turning, strict=True) if turning]
     slides = [name for name, turning in zip(joints, robot.turning, strict=True) if not turning]
@@ -165,8 +173,8 @@ def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
         "joint positions": ("positions [m]", slides),
         "joint velocities": ("velocities [rad/s or m/s]", joints),
         "command leads": ("command minus joint position, relative to the largest lead", joints),
-        "gripper opening": ("opening as measured [m], see gripper", []),
-        "gripper command": ("mean command of the gripper's actuators [m]", []),
+        "gripper opening": ("opening as measured, see gripper", []),
+        "gripper command": (f"mean command of the gripper's actuators [{unit}]", []),
         "end effector": ("position [m], world frame", [m.site(robot.tool).name]),
     }
     for i, body in enumerate(task.objects):
@@ -238,7 +246,8 @@ def _described_action(task: Task) -> dict[str, Any]:
         rows.append(row | {"limits": _limits(task, int(actuator)), "lead": float(robot.lead[i])})
     if len(robot.gripper):
         names = [m.actuator(a).name for a in robot.gripper]
-        row = {"name": "gripper", "actuators": names, "unit": "m", "scale": float(robot.step[-1])}
+        unit = "m" if robot.in_metres else COMMAND_UNIT
+        row = {"name": "gripper", "actuators": names, "unit": unit, "scale": float(robot.step[-1])}
         rows.append(row | {"limits": _limits(task, int(robot.gripper[0])), "lead": None})
     return {
         "output": OUTPUT,
@@ -268,7 +277,7 @@ def _described_gripper(task: Task) -> dict[str, Any] | None:
             weights[m.joint(j).name] = weight
     return {
         "actuators": [m.actuator(a).name for a in robot.gripper],
-        "opening": "sum of weight times joint position [m]",
+        "opening": f"sum of weight times joint position [{'m' if robot.in_metres else 'm or rad'}]",
         "weights": weights,
-        "convention": "one number for all actuators: above 0 raises their commands and opens, below 0 closes",
+        "convention": f"one number for all actuators: {MEANING[robot.in_metres]}",
     }

@@ -95,6 +95,7 @@ class Policy:
             turn=action_scale * action.turn,
             slide=action_scale * action.slide,
             gripper=action_scale * action.gripper,
+            gripper_share=action_scale * action.gripper_share,
             turn_lead=setpoint_lead_scale * action.turn_lead,
             slide_lead=setpoint_lead_scale * action.slide_lead,
         )

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import TrainError
+from concent_warp.simulate.activation import initial_activation
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.inverse_kinematics import solve_inverse_kinematics
@@ -298,6 +299,7 @@ class ResetSampler:
         mujoco.mj_resetData(m, d)
         d.qpos[:], d.ctrl[:] = candidate.qpos, candidate.ctrl
         d.mocap_pos[:], d.mocap_quat[:] = candidate.mocap[:, :3], candidate.mocap[:, 3:]
+        d.act[:] = initial_activation(m, d, candidate.ctrl)
         mujoco.mj_kinematics(m, d)
         before = self.monitored_position(candidate)
         for _ in range(round(self.cfg.settling_time / m.opt.timestep)):
