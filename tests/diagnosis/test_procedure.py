@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from concent_warp.diagnosis import procedure as module
+from concent_warp.diagnosis.replayed import Replayed
 from concent_warp.diagnosis.result import UnknownForceFound
 from concent_warp.diagnosis.search import additions, context
 from tests.diagnosis.made_up import FINER, MODEL, RECORDING, finding, node, procedure
@@ -257,14 +258,19 @@ def test_what_is_left_is_no_error_of_form_where_no_effect_was_accepted(monkeypat
 
 def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
     asked: list[Any] = []
+    said = Replayed(40.0, 1.5, 0.3, False)
+    replays: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(module, "replayed", lambda *args: replays.append(args) or said)
     monkeypatch.setattr(module, "unknown_force", lambda *_: None)
     monkeypatch.setattr(module, "locate_failures", lambda *args, **more: asked.append((args, more)) or [{"span": 1}])
     monkeypatch.setattr(module, "suggest_experiment", lambda *args, **more: asked.append((args, more)) or "experiment")
     made = procedure(explain=True, seed=7)
     made.record.hypotheses = [{"a": MODEL}, {"b": MODEL, "c": MODEL}, {"d": MODEL, "e": MODEL}]
-    given = node(3.0, name="given")
-    found = made.conclude(given, [given, node(1.0)], (), ())
-    assert (found.where, found.next_experiment) == (({"span": 1},), "experiment")
+    given, last = node(3.0, name="given"), node(1.0)
+    found = made.conclude(given, [given, last], (), ())
+    assert (found.where, found.next_experiment, found.replayed) == (({"span": 1},), "experiment", said)
+    limit = made.context.cfg.doubtful_replay
+    assert replays == [(given.model, last.delivered, RECORDING, last.windows, limit, "mujoco")]
     (model, recording, cfg), more = asked[0]
     assert (model.name, recording) == ("given", RECORDING)
     assert cfg == made.context.cfg.failures
@@ -276,5 +282,6 @@ def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
     lone.record.hypotheses = [{"a": MODEL}]
     assert lone.conclude(node(3.0), [node(3.0), node(1.0)], (), ()).next_experiment is None
     none = procedure(explain=True)
-    assert none.conclude(node(1.0), [node(1.0)], (), ()).where == ()
+    settled = none.conclude(node(1.0), [node(1.0)], (), ())
+    assert (settled.where, settled.replayed) == ((), None)
     assert len(asked) == 1
