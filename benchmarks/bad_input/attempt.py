@@ -210,6 +210,7 @@ def _judged(process: _Process, code: int, memory: int) -> Outcome:
     changed = sorted(name for name in process.before.keys() | after if process.before.get(name) != after.get(name))
     lines = [line for line in text.splitlines() if not line.endswith(": loading ...") and ": warning: " not in line]
     message = "\n".join(lines).replace(f"{root / 'inputs'}{os.sep}", "").replace(str(root), "")
+    message = message.replace(f"{Path(__file__).parents[2]}{os.sep}", "")  # files that come with the package
     return Outcome(process.case, code, message.strip(), changed, seconds, memory)
 
 

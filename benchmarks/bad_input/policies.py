@@ -124,7 +124,7 @@ def folders() -> Iterator[tuple[str, Callable[[Path], object]]]:
         "worlds of text": ("worlds = 4096", 'worlds = "many"'),
         "worlds -1": ("worlds = 4096", "worlds = -1"),
         "worlds of 400 digits": ("worlds = 4096", f"worlds = {'4' * 400}"),
-        "a seed of -1": ("seed = 0", "seed = -1"),
+        "a seed of -1": ("seed = 12", "seed = -1"),
         "an unknown stage": ('stage = "insert"', 'stage = "dance"'),
         "an unknown gripper": ('"gripper",', '"hand",'),
         "an unknown tool site": ('tool_site = "tcp"', 'tool_site = "tool"'),
@@ -138,7 +138,7 @@ def folders() -> Iterator[tuple[str, Callable[[Path], object]]]:
         "slots -8": ("slots = 8", "slots = -8"),
         "slots 3": ("slots = 8", "slots = 3"),
         "an environment that is a number": ("[environment]\n", "[rest]\n"),
-        "action steps infinite": ("turn = 0.02", "turn = inf"),
+        "action steps infinite": ("turn = 0.006", "turn = inf"),
         "place of one number": ("    0.05,\n    0.03,\n", "    0.05,\n"),
     }
     for name, (old, new) in replaced.items():
