@@ -8,6 +8,7 @@ from pathlib import Path
 
 from concent_warp.deploy.cfg import splat_files
 from concent_warp.deploy.simulated_images import simulated_images
+from concent_warp.errors import RenderError
 from concent_warp.run_folder import RunFolder, plain, run_folder, write_settings
 from concent_warp.train.distil.cfg import DistilCfg
 from concent_warp.train.distil.run import Distillation, run_distillation
@@ -62,6 +63,8 @@ def distil(
     """
     cfg, process = cfg or DistilCfg(), DistributedProcess.from_environment()
     splat_files(cfg.images.splats)  # before worlds are made
+    if (networks := cfg.images.networks) is not None and not Path(networks).exists():
+        raise RenderError("there are no trained networks", where=networks, fix="train them with concent render-train")
     folder = None if out is None else Path(out)
     inputs = Distillation(policy, cfg, lambda environment: simulated_images(environment, cfg.images, cfg.looks))
     with process.group(process.device(device)), ExitStack() as stack:

@@ -14,7 +14,7 @@ import torch
 import concent_warp as cw
 from concent_warp.cli import main
 from concent_warp.deploy.simulated_images import simulated_images
-from concent_warp.errors import ConcentError, TrainError
+from concent_warp.errors import ConcentError, RenderError, TrainError
 from concent_warp.train.distil.dagger import Dagger
 from concent_warp.train.distil.run import Distillation
 from concent_warp.train.distil.samples import Samples
@@ -116,6 +116,12 @@ def test_a_distillation_begins_with_another_student_and_keeps_its_statistics(tea
     assert begun.weights["iteration"] == 1
     for name, value in student.weights["student"].items():
         assert torch.allclose(begun.weights["student"][name], value, atol=1e-5), name
+
+
+def test_missing_networks_are_refused_before_worlds_are_made(teacher, monkeypatch):
+    monkeypatch.setattr("concent_warp.deploy.distil.run_distillation", lambda *_, **__: pytest.fail("worlds were made"))
+    with pytest.raises(RenderError, match="no trained networks"):
+        cw.distil(teacher, replace(TINY, images=replace(TINY.images, networks="gone")), device="cpu")
 
 
 def test_a_student_of_another_network_is_none_to_begin_with(teacher, student, tmp_path):
