@@ -102,8 +102,12 @@ class RewardCfg:
     """Amplitude and length scale [m] of the near reaching term."""
     wide: Range = (1.0, 0.3)
     """Amplitude and length scale [m] of a third reaching term in chains of stages, for the approach to an object."""
-    stage: float = 5.0
-    """Reward per step for each completed stage; larger than the reaching terms, so that the next stage pays off."""
+    completion: float = 250.0
+    """In chains, reward of each stage that is completed, the last one too, once in an episode: more than the reaching
+    terms bring within the horizon of the discount, so that the next stage pays off."""
+    stage: float = 0.0
+    """In chains, reward per step for each completed stage. An object dropped in a later stage then costs as much as all
+    stages before were worth, so that policies learn not to try."""
     action: float = 0.01
     """Penalty of the squared action [-]."""
     velocity: float = 0.001

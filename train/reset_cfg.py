@@ -78,6 +78,10 @@ class ResetCfg:
     free: Share = 0.3
     """In chains of stages, share of initial states of the whole task: the robot as at the start of the demonstration,
     the objects anywhere. The others are shared equally among the stages."""
+    along_path: Share = 0.5
+    """In chains, share of states whose moments are uniform along the hand's path, the others' in time: a block is in
+    the hole for a while and slides into it in a moment. From the first contact of the objects on, these states are as
+    demonstrated relative to object 2."""
     place: tuple[float, float] = (0.05, 0.03)
     """In chains, half widths of the squares around the demonstrated positions of objects 1 and 2 [m]."""
     heading: tuple[float, float] = (0.5, 0.3)
@@ -94,7 +98,7 @@ class ResetCfg:
     overlap: float = 0.0015
     """Penetration of spheres of different objects above which a displaced state is discarded [m]."""
     passes: Count = 20
-    """Largest number of passes, of `states` candidates each, after which sampling fails."""
+    """Largest number of candidates for each state, on average, after which sampling fails."""
     stuck: StuckCfg = field(default_factory=StuckCfg)
     """States in which progress stopped."""
     solver: Literal["auto", "newton", "posture"] = "auto"

@@ -9,6 +9,7 @@ import torch
 from small_insertion import CHAIN, HOLE, SETTINGS, make_task
 
 from concent_warp.errors import TrainError
+from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
@@ -27,7 +28,7 @@ def chain() -> Task:
 
 @pytest.fixture(scope="module")
 def drawn(chain) -> ResetStates:
-    return sample_reset_states(chain, CHAIN.reset, 0, count=80)
+    return sample_reset_states(chain, CHAIN.reset, 0, count=160)
 
 
 @pytest.fixture
@@ -83,19 +84,34 @@ def test_world_moves_on_exactly_when_its_target_has_been_met_for_long_enough(as_
 
 
 def test_moving_on_is_never_worse_than_staying(as_shown):
-    environment, terms, stages = as_shown, [], []
+    environment, stages, reached, completed = as_shown, [], [], []
     environment.start_from([0, 1])
-    for k in range(60):
+    for k in range(environment.max_episode_length):
         stages.append(environment.stage.tolist()[0])
         environment.step(as_demonstrated(environment, k))
-        terms.append(environment.terms[0, [TERMS.index("reach"), TERMS.index("stages")]].clone())
+        reached.append(float(environment.terms[0, TERMS.index("reach")]))
+        completed.append(float(environment.terms[0, TERMS.index("stages")]))
         if environment.done.any():
             break
-    told = torch.stack(terms).sum(dim=1)
-    best = [max(float(t) for t, s in zip(told, stages, strict=True) if s == stage) for stage in (0, 1, 2)]
-    least = [min(float(t) for t, s in zip(told, stages, strict=True) if s == stage) for stage in (0, 1, 2)]
-    assert best[0] < least[1]
-    assert best[1] < least[2]
+    horizon = 1 / (1 - TrainCfg().ppo.discount)
+    for stage in (0, 1):
+        best = max(value for value, s in zip(reached, stages, strict=True) if s == stage)
+        least = min(value for value, s in zip(reached, stages, strict=True) if s == stage + 1)
+        assert best * horizon < CHAIN.reward.completion + least * horizon
+    assert [value for value in completed if value] == [CHAIN.reward.completion] * 3
+
+
+def test_a_completed_stage_is_paid_once_though_its_target_is_left_and_met_again(as_shown):
+    environment, paid = as_shown, 0.0
+    environment.start_from([0, 1])
+    steps = environment.max_episode_length
+    # The block is lifted out of the hole and put back before it has rested there.
+    environment._rest = steps
+    inserted = round(3.2 / environment.control_step)
+    for k in [*range(inserted), *range(inserted, inserted - 25, -1), *range(inserted - 25, inserted)]:
+        environment.step(as_demonstrated(environment, k))
+        paid += float(environment.terms[0, TERMS.index("stages")])
+    assert paid == 3 * CHAIN.reward.completion
 
 
 def test_observation_shows_the_stage_that_the_world_is_in(chain, drawn):
@@ -175,6 +191,43 @@ def test_states_of_all_stages_keep_the_contact_chain(chain, drawn):
     assert set(drawn.case) == {1, 2, 3}
     assert 0.1 < drawn.begins.mean() < 0.5
     assert not drawn.stage[drawn.begins].any()
+
+
+def test_states_slide_into_the_hole_as_often_as_the_hand_moves_there(chain):
+    shown = chain.demonstrated
+    assert shown is not None
+    sampled = {
+        share: sample_reset_states(
+            chain, replace(CHAIN.reset, along_path=share, free=0.0, demonstrated=1.0), 0, count=120
+        )
+        for share in (0.0, 1.0)
+    }
+    d = mujoco.MjData(chain.compiled)
+
+    def height(qpos: np.ndarray) -> float:
+        d.qpos[:] = qpos
+        mujoco.mj_kinematics(chain.compiled, d)
+        return float(d.site_xpos[chain.robot.tool][2])
+
+    spread = {}
+    for share, states in sampled.items():
+        heights = np.sort(
+            [height(q) for q, stage in zip(states.qpos, states.stage, strict=True) if stage == chain.stage]
+        )
+        spread[share] = np.diff(heights).max() / np.ptp(heights)
+    # Sampled in time, many states are at the ends of the motion, and gaps are between.
+    assert spread[1.0] < spread[0.0]
+
+
+def test_another_state_of_the_same_stage_takes_the_place_of_a_discarded_one(chain):
+    # So large displacements that most states in the hole overlap.
+    wild = replace(CHAIN.reset, along_path=0.0, demonstrated=0.0, free=0.25, position=0.02)
+    states = sample_reset_states(chain, wild, 0, count=400)
+    assert states.discarded["overlapping"] > 40
+    inner = states.stage[~states.begins]
+    shares = np.bincount(inner, minlength=3) / len(inner)
+    assert np.abs(shares - 1 / 3).max() < 0.08
+    assert states.begins.mean() == pytest.approx(0.25, abs=0.06)
 
 
 def test_saved_chain_is_gone_on_with_exactly(chain, drawn):

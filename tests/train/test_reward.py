@@ -155,12 +155,12 @@ def test_the_reward_is_the_scaled_sum_of_its_terms_divided_by_the_chained_stages
             torch.testing.assert_close(reward, cfg.reward.scale / stages * made.terms.sum(dim=1))
 
 
-def test_a_later_stage_is_worth_more_than_an_earlier_one():
-    chain = make_task(CHAIN)
+def test_completed_stages_are_rewarded_in_every_step_where_asked_for():
+    chain, cfg = make_task(CHAIN), replace(CHAIN, worlds=12, reward=RewardCfg(stage=5.0, completion=0.0))
     drawn = sample_reset_states(chain, CHAIN.reset, 1, count=12)
-    made = make_environment(chain, replace(CHAIN, worlds=12), drawn, device="cpu")
+    made = make_environment(chain, cfg, drawn, device="cpu")
     made.start_from(range(12))
     stage = made.stage.clone()
     assert stage.unique().tolist() == [0, 1, 2]
     made.step(torch.zeros(made.num_envs, made.num_actions))
-    torch.testing.assert_close(made.terms[:, TERMS.index("stages")], CHAIN.reward.stage * stage.float())
+    torch.testing.assert_close(made.terms[:, TERMS.index("stages")], 5.0 * stage.float())

@@ -71,7 +71,7 @@ class Environment(VecEnv):
         """Time between actions [s]."""
         self.max_episode_length = max(1, round(cfg.seconds / self.control_step))
         self.cfg = asdict(cfg)
-        self._settings = cfg
+        self._settings, self._is_chain = cfg, task.demonstrated is not None
         self.perturbs_trials = False
         """Whether random forces act on the grasped object in evaluations too."""
         self._initial = InitialStates(states, cfg.reset.stuck, self.num_envs, self.device, self.control_step)
@@ -188,7 +188,7 @@ class Environment(VecEnv):
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self._return = torch.zeros(n, device=device)
         chained = [self.task.events.stages[s].name for s in self.task.chained]
-        self._log = StepLog(chained, is_chain=self.task.demonstrated is not None, device=str(device))
+        self._log = StepLog(chained, is_chain=self._is_chain, device=str(device))
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
         self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
@@ -417,7 +417,9 @@ class Environment(VecEnv):
         lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float()) / self._lead
         effort = effort_penalties(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
         disturb = disturbance_penalty(cfg, self._pose_before, self._object_poses())
-        weighted = [cfg.reach * self._reaching(), cfg.stage * (self.stage - self.task.first).float()]
+        reaching, completed = cfg.reach * self._reaching(), (self.stage - self.task.first).float()
+        newly = self._advance_stages(valid & ~failed)
+        weighted = [reaching, cfg.stage * completed + cfg.completion * self._is_chain * newly]
         weighted += [cfg.regularisation * t for t in (*effort, disturb)]
         strictness = cfg.lenience + (1 - cfg.lenience) * self._success_average.square()
         weighted += [cfg.vcp * strictness * self._penalty, self._none]
@@ -426,7 +428,6 @@ class Environment(VecEnv):
         self.terms.copy_(terms)
         self.reward.copy_(cfg.scale / len(self.task.chained) * terms.sum(dim=1))
 
-        self._advance_stages(valid & ~failed)
         self.episode_length_buf += 1
         self._return += self.reward
         finished = (self.episode_length_buf >= self.max_episode_length) | (self._steps_at_rest >= self._rest)
@@ -442,7 +443,7 @@ class Environment(VecEnv):
 
     def _reaching(self) -> torch.Tensor:
         """Return the reaching reward of each world's stage, shape (N,)."""
-        cfg, chained = self._settings.reward, self.task.demonstrated is not None
+        cfg, chained = self._settings.reward, self._is_chain
         reach = self._reach.sum(dim=1)
         if chained:
             reach = reach + (self._worst_pair >= 0) * cfg.wide[0] * torch.exp(-self._worst / cfg.wide[1])
@@ -451,24 +452,30 @@ class Environment(VecEnv):
         engineered = engineered_reward(cfg.engineered, self.relative_position())
         return torch.where(self.stage == self.task.stage, engineered, reach) if chained else engineered
 
-    def _advance_stages(self, valid: torch.Tensor) -> None:
+    def _advance_stages(self, valid: torch.Tensor) -> torch.Tensor:
         """Advance worlds that met their target to the next stage, and count the steps of object 1 in place.
 
         Args:
             valid: Worlds without failure, shape (N,) bool.
+
+        Returns:
+            Number of stages that are completed for the first time in the episode, 0 or 1, shape (N,).
         """
         chain = self._settings.chain
         # The controller moves on by what it observes, not by the truth.
         near = (self._worst_pair >= 0) & (self._seen_worst < chain.tolerance) & valid
         self._steps_within.copy_(torch.where(near, self._steps_within + 1, 0))
         met = self._steps_within >= chain.hold
-        self._stages_met.copy_(torch.maximum(self._stages_met, self.stage - self.task.first + met))
+        completed = torch.maximum(self._stages_met, self.stage - self.task.first + met)
+        newly = completed - self._stages_met
+        self._stages_met.copy_(completed)
         self.reached.copy_(self._stages_met)
         onward = met & (self.stage < self.task.stage)
         self.stage += onward
         self._steps_within.masked_fill_(onward, 0)
-        if self.task.demonstrated is not None:
+        if self._is_chain:
             self._steps_at_rest.copy_(torch.where(self.success & valid, self._steps_at_rest + 1, 0))
+        return newly
 
     def _count(self, terms: torch.Tensor) -> None:
         """Add a step to the sums of the log, and update the running success rate."""

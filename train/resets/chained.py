@@ -45,6 +45,8 @@ class ChainedResetSampler(ResetSampler):
         self.stages = task.demonstrated
         self.grasp, self.touch = self.contact_times()
         self.key_positions = [self.positions(time) for time in (0.0, self.grasp, self.touch)]
+        self.paths = {stage: self.path(self.stages.start[stage], self.stages.end[stage]) for stage in task.chained}
+        self.owed: list[tuple[int, bool]] = []
 
     def contact_times(self) -> tuple[float, float]:
         """Return the times of the grasp of object 1 and of its first contact with object 2 [s].
@@ -64,17 +66,40 @@ class ChainedResetSampler(ResetSampler):
         mujoco.mj_kinematics(self.m, self.d)
         return self.d.site_xpos[self.task.robot.tool].copy(), self.d.xpos[self.task.objects[0]].copy()
 
+    def path(self, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return demonstrated times [s] and the length of the hand's path up to each [m], shape (T,) each."""
+        times = np.append(np.arange(start, end, self.task.replay.timestep), end)
+        places = np.array([self.positions(time)[0] for time in times])
+        return times, np.append(0.0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
+
     def candidate(self) -> ResetCandidate:
-        """Sample a time of a stage, or an initial state of the chain, and poses of the objects."""
+        """Sample a moment of a stage, or an initial state of the chain, and poses of the objects."""
         begins = bool(self.rng.random() < self.cfg.free) and self.task.first == 0
         stage = self.task.first if begins else int(self.rng.choice(self.task.chained))
-        time = 0.0 if begins else self.rng.uniform(self.stages.start[stage], self.stages.end[stage])
-        candidate = self.demonstrated(time, bool(self.rng.random() < self.cfg.demonstrated), stage)
+        if self.owed:
+            stage, begins = self.owed.pop()
+        along_path, as_demonstrated = self.rng.random(2) < (self.cfg.along_path, self.cfg.demonstrated)
+        time = 0.0 if begins else self.moment(stage, along_path=bool(along_path))
+        # In a hole, for example, almost every displaced state overlaps.
+        together = bool(along_path) and time >= self.touch
+        candidate = self.demonstrated(time, bool(as_demonstrated) or together, stage)
         candidate.begins, candidate.hand_free = begins, candidate.case == 1
         self.deform(candidate, self.displace_objects(candidate))
-        # Outside case 3 relative poses differ from the demonstration, so overlaps must be checked.
-        candidate.as_demonstrated = candidate.as_demonstrated and candidate.case == 3
+        # Elsewhere relative poses differ from the demonstration, so overlaps must be checked.
+        candidate.as_demonstrated = candidate.as_demonstrated and candidate.case > 1 and time >= self.touch
         return candidate
+
+    def moment(self, stage: int, *, along_path: bool) -> float:
+        """Sample a moment of a stage, uniform along the hand's path or in time [s]."""
+        times, lengths = self.paths[stage]
+        if along_path and lengths[-1] > 0:
+            return float(np.interp(self.rng.uniform(0, lengths[-1]), lengths, times))
+        return float(self.rng.uniform(times[0], times[-1]))
+
+    def discard(self, candidate: ResetCandidate, reason: str) -> None:
+        """Count a candidate that is discarded; another one of its stage is sampled in its place."""
+        super().discard(candidate, reason)
+        self.owed.append((candidate.stage, candidate.begins))
 
     def displace_objects(self, candidate: ResetCandidate) -> tuple[PlanarMotion, PlanarMotion]:
         """Displace object 2, and return the motions of objects 1 and 2."""

@@ -113,14 +113,17 @@ class ResetSampler:
             TrainError: Too many candidates were discarded.
         """
         found: list[tuple[np.ndarray, ResetCandidate]] = []
-        for _ in range(self.cfg.passes):
-            for candidate in self.with_joints([self.candidate() for _ in range(count)]):
+        left = self.cfg.passes * count
+        while left > 0 and len(found) < count:
+            sampled = [self.candidate() for _ in range(min(count - len(found), left))]
+            left -= len(sampled)
+            for candidate in self.with_joints(sampled):
                 if (settled := self.checked(candidate)) is not None:
                     found.append((settled, candidate))
                     if progress is not None and len(found) % 32 == 0:
                         progress(len(found) / count)
-                if len(found) == count:
-                    return self.stacked(found)
+        if len(found) == count:
+            return self.stacked(found)
         raise TrainError(
             "too few initial states keep the contact chain",
             expected=count,
@@ -190,7 +193,7 @@ class ResetSampler:
                     )
                 joints = solutions[i]
                 if joints is None:
-                    self.discarded["unreachable"] += 1
+                    self.discard(candidate, "unreachable")
                     continue
                 candidate.qpos[robot.qpos] = joints
             yield candidate
@@ -198,15 +201,20 @@ class ResetSampler:
     def checked(self, candidate: ResetCandidate) -> np.ndarray | None:
         """Return the settled positions of a candidate, shape (nq,), None if it is discarded; sets its commands."""
         if not candidate.as_demonstrated and self.overlap(candidate) > self.cfg.overlap:
-            self.discarded["overlapping"] += 1
+            self.discard(candidate, "overlapping")
             return None
         # Demonstrated commands differ from the joints by lag and contact forces; at rest they equal the joints.
         robot = self.task.robot
         candidate.ctrl[robot.actuator] = np.clip(candidate.qpos[robot.qpos], *self.command_limits(robot.actuator))
         settled = self.settled_state(candidate)
         if settled is None:
-            self.discarded["chain broken"] += 1
+            self.discard(candidate, "chain broken")
         return settled
+
+    def discard(self, candidate: ResetCandidate, reason: str) -> None:
+        """Count a candidate that is discarded."""
+        del candidate
+        self.discarded[reason] += 1
 
     def command_limits(self, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper limits of commands, shape of `actuators`; infinite without limits."""
