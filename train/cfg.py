@@ -103,8 +103,8 @@ class RewardCfg:
     wide: Range = (1.0, 0.3)
     """Amplitude and length scale [m] of a third reaching term in chains of stages, for the approach to an object."""
     completion: float = 250.0
-    """In chains, reward of each stage that is completed, the last one too, once in an episode: more than the reaching
-    terms bring within the horizon of the discount, so that the next stage pays off."""
+    """In chains, reward of each completed stage, once in an episode, of the last one when object 1 has come to rest in
+    place: more than the reaching terms bring within the horizon of the discount, so that the next stage pays off."""
     stage: float = 0.0
     """In chains, reward per step for each completed stage. An object dropped in a later stage then costs as much as all
     stages before were worth, so that policies learn not to try."""

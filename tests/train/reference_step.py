@@ -274,12 +274,12 @@ class Reference:
         result.within = episode.within + 1 if worst < cfg.chain.tolerance and not failed else 0
         met = result.within >= cfg.chain.hold
         result.met = max(episode.met, stage - task.first + met)
-        if self.chained:
-            terms["stages"] += reward.completion * (result.met - episode.met) * (not failure[2])
         if met and stage < task.stage:
             result.stage, result.within = stage + 1, 0
         if self.chained:
             result.at_rest = episode.at_rest + 1 if success and not failed else 0
+        completed = (met and stage < task.stage) or result.at_rest >= self.rest
+        terms["stages"] += reward.completion * completed
         value = reward.scale * sum(terms.values()) / len(task.chained)
         result.length, result.total = episode.length + 1, episode.total + value
         over = result.length >= self.steps or result.at_rest >= self.rest

@@ -101,17 +101,24 @@ def test_moving_on_is_never_worse_than_staying(as_shown):
     assert [value for value in completed if value] == [CHAIN.reward.completion] * 3
 
 
-def test_a_completed_stage_is_paid_once_though_its_target_is_left_and_met_again(as_shown):
-    environment, paid = as_shown, 0.0
+def test_insertion_is_paid_when_the_block_has_come_to_rest_and_not_before(as_shown):
+    environment, stages = as_shown, TERMS.index("stages")
     environment.start_from([0, 1])
-    steps = environment.max_episode_length
-    # The block is lifted out of the hole and put back before it has rested there.
-    environment._rest = steps
-    inserted = round(3.2 / environment.control_step)
-    for k in [*range(inserted), *range(inserted, inserted - 25, -1), *range(inserted - 25, inserted)]:
+    rest = round(CHAIN.chain.rest / environment.control_step)
+    inserted = round(3.15 / environment.control_step)
+    paid, in_place = [], []
+    # The block is lifted out of the hole before it has rested there, and put back.
+    lifted = [*range(inserted), *range(inserted, inserted - 15, -1), *range(inserted - 15, inserted)]
+    for k in [*lifted, *[inserted] * 2 * rest]:
         environment.step(as_demonstrated(environment, k))
-        paid += float(environment.terms[0, TERMS.index("stages")])
-    assert paid == 3 * CHAIN.reward.completion
+        paid.append(float(environment.terms[0, stages]))
+        in_place.append(bool(environment.success[0]))
+        if environment.done[0]:
+            break
+    assert [value for value in paid if value] == [CHAIN.reward.completion] * 3
+    assert paid[-1]
+    assert all(in_place[-rest:])
+    assert any(in_place[:-rest])
 
 
 def test_observation_shows_the_stage_that_the_world_is_in(chain, drawn):

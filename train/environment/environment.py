@@ -417,9 +417,9 @@ class Environment(VecEnv):
         lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float()) / self._lead
         effort = effort_penalties(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
         disturb = disturbance_penalty(cfg, self._pose_before, self._object_poses())
-        reaching, completed = cfg.reach * self._reaching(), (self.stage - self.task.first).float()
-        newly = self._advance_stages(valid & ~failed)
-        weighted = [reaching, cfg.stage * completed + cfg.completion * self._is_chain * newly]
+        reaching, before = cfg.reach * self._reaching(), (self.stage - self.task.first).float()
+        completed = self._advance_stages(valid & ~failed)
+        weighted = [reaching, cfg.stage * before + cfg.completion * completed]
         weighted += [cfg.regularisation * t for t in (*effort, disturb)]
         strictness = cfg.lenience + (1 - cfg.lenience) * self._success_average.square()
         weighted += [cfg.vcp * strictness * self._penalty, self._none]
@@ -459,23 +459,21 @@ class Environment(VecEnv):
             valid: Worlds without failure, shape (N,) bool.
 
         Returns:
-            Number of stages that are completed for the first time in the episode, 0 or 1, shape (N,).
+            Whether a stage is completed, shape (N,) bool: of a chain's last stage, whether object 1 has come to rest.
         """
         chain = self._settings.chain
         # The controller moves on by what it observes, not by the truth.
         near = (self._worst_pair >= 0) & (self._seen_worst < chain.tolerance) & valid
         self._steps_within.copy_(torch.where(near, self._steps_within + 1, 0))
         met = self._steps_within >= chain.hold
-        completed = torch.maximum(self._stages_met, self.stage - self.task.first + met)
-        newly = completed - self._stages_met
-        self._stages_met.copy_(completed)
+        self._stages_met.copy_(torch.maximum(self._stages_met, self.stage - self.task.first + met))
         self.reached.copy_(self._stages_met)
         onward = met & (self.stage < self.task.stage)
         self.stage += onward
         self._steps_within.masked_fill_(onward, 0)
         if self._is_chain:
             self._steps_at_rest.copy_(torch.where(self.success & valid, self._steps_at_rest + 1, 0))
-        return newly
+        return onward | (self._steps_at_rest >= self._rest)
 
     def _count(self, terms: torch.Tensor) -> None:
         """Add a step to the sums of the log, and update the running success rate."""
