@@ -53,8 +53,11 @@ types: .venv/installed-dev layout
 imports: .venv/installed-dev layout
 	cd $(dir $(LAYOUT)) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-cache
 
+# What is compiled of the sources is kept, also for the processes that tests start. Files run in the order of
+# `tests/conftest.py`, the longest first.
 tests: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest \
+		-n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # lerobot wants another Python and another torch than the rest.
 lerobot:

@@ -7,6 +7,18 @@ from pathlib import Path
 
 import pytest
 
+LONG = (
+    *("test_foreign_recordings.py", "test_robustness.py", "test_docs.py", "test_train.py", "test_rough_impacts.py"),
+    *("test_distil.py", "test_hidden_effects_benchmark.py", "test_docs_site.py", "test_data_parallel.py"),
+    *("test_disk_full.py", "test_flow_at_work.py", "test_front_door.py", "test_distil_benchmark.py"),
+)
+"""Files of most of a minute, the longest first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put long files first, so that no worker begins one when the others have nothing left to do."""
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
 
 @pytest.fixture(scope="session")
 def root() -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -78,6 +78,7 @@ def simulate(
     keep = np.exp(-model.opt.timestep / sensing.tracking_time)
     kick = sensing.tracking_std * np.sqrt(1 - keep**2)
     next_frame = 0.0
+    bodies = [model.body(body).name for body in model.geom_bodyid]
     for k in range(steps + 1):
         now = k * model.opt.timestep
         ctrl = action[np.searchsorted(time, now + 1e-9, side="right") - 1]
@@ -92,7 +93,7 @@ def simulate(
         log.time.append(now)
         log.qpos.append(qpos)
         log.sensordata.append(data.sensordata.copy())
-        log.pairs.append(_touching(model, data))
+        log.pairs.append(_touching(model, data, bodies))
         if now >= next_frame - 1e-9:
             next_frame += 1 / sensing.point_rate
             log.frames.append(now)
@@ -107,16 +108,21 @@ def simulate(
     return log
 
 
-def _touching(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, str], np.ndarray]:
-    """Return the body pairs in contact, in alphabetical order, with the force on the second [N], world frame."""
+def _touching(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[str]) -> dict[tuple[str, str], np.ndarray]:
+    """Return the body pairs in contact, in alphabetical order, with the force on the second [N], world frame.
+
+    Args:
+        model: Reality.
+        data: Its state.
+        bodies: Name of the body of each geom.
+    """
     pairs: dict[tuple[str, str], np.ndarray] = {}
     force = np.zeros(6)
-    for i, contact in enumerate(data.contact):
-        if contact.efc_address < 0:
-            continue
-        first, second = (model.body(model.geom_bodyid[g]).name for g in contact.geom)
+    geoms, frames = data.contact.geom, data.contact.frame.reshape(-1, 3, 3)
+    for i in np.flatnonzero(data.contact.efc_address >= 0):
+        first, second = (bodies[int(geom)] for geom in geoms[i])
         mujoco.mj_contactForce(model, data, i, force)
-        vector = contact.frame.reshape(3, 3).T @ force[:3]
+        vector = frames[i].T @ force[:3]
         pair, vector = ((first, second), vector) if first <= second else ((second, first), -vector)
         pairs[pair] = pairs.get(pair, np.zeros(3)) + vector
     return pairs

@@ -1,8 +1,10 @@
 """Inputs are checked before warp and torch are imported, which takes seconds."""
 
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -10,12 +12,28 @@ from concent_warp.cli import main
 from concent_warp.cli.entry import COMMANDS
 
 PROBE = """
-import sys
+import json, os, sys
+import h5py, mujoco, scipy.optimize, scipy.spatial, tyro  # not heavy, and imported once for all cases
 from concent_warp.cli.entry import main
 
-code = main(sys.argv[1:])
-print("imported:", *(name for name in ("torch", "warp") if name in sys.modules))
-sys.exit(code)
+def tell(folder, words):
+    os.chdir(folder)
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(folder + "." + name, os.O_WRONLY | os.O_CREAT), number)
+    code = main(words)
+    print("imported:", *(name for name in ("torch", "warp") if name in sys.modules), flush=True)
+    return code
+
+codes = []
+for folder, line in json.loads(sys.argv[1]):
+    child, code = os.fork(), 70
+    if not child:
+        try:
+            code = tell(folder, line.split())
+        finally:
+            os._exit(code)
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(json.dumps(codes))
 """
 CASES = [
     ("evaluate", "one policy is to be run; expected either --checkpoint"),
@@ -51,25 +69,37 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("line", "words"), CASES, ids=[line for line, _ in CASES])
-def test_inputs_are_checked_before_heavy_imports(line, words, bench, tmp_path):
-    for path in bench.iterdir():
-        if path.is_file():
-            (tmp_path / path.name).symlink_to(path)
-    (tmp_path / "text.pt").write_text("no checkpoint")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "notes.txt").write_text("notes")
-    before = sorted(tmp_path.rglob("*"))
+@pytest.fixture(scope="module")
+def told(bench, tmp_path_factory) -> dict[str, tuple[int, Path, list[Path]]]:
+    """Return the exit code of each case, its folder with what it said beside it, and the files that were in it."""
+    folders, before = {}, {}
+    for line, _ in CASES:
+        folder = folders[line] = tmp_path_factory.mktemp("case")
+        for path in bench.iterdir():
+            if path.is_file():
+                (folder / path.name).symlink_to(path)
+        (folder / "text.pt").write_text("no checkpoint")
+        (folder / "other").mkdir()
+        (folder / "other" / "notes.txt").write_text("notes")
+        before[line] = sorted(folder.rglob("*"))
+    cases = json.dumps([(str(folder), line) for line, folder in folders.items()])
     done = subprocess.run(
-        [sys.executable, "-c", PROBE, *line.split()], capture_output=True, text=True, cwd=tmp_path, check=False,
+        [sys.executable, "-c", PROBE, cases], capture_output=True, text=True, check=True,
         env=os.environ | {"PYTHONWARNINGS": "ignore"},
     )  # fmt: skip
-    said = [one for one in done.stderr.splitlines() if "loading" not in one]
-    assert done.returncode == 2
+    codes = json.loads(done.stdout)
+    return {line: (code, folders[line], before[line]) for (line, _), code in zip(CASES, codes, strict=True)}
+
+
+@pytest.mark.parametrize(("line", "words"), CASES, ids=[line for line, _ in CASES])
+def test_inputs_are_checked_before_heavy_imports(line, words, told):
+    code, folder, before = told[line]
+    said = [one for one in Path(f"{folder}.err").read_text().splitlines() if "loading" not in one]
+    assert code == 2
     assert len(said) == 1
     assert words in said[0]
-    assert done.stdout == "imported:\n"
-    assert sorted(tmp_path.rglob("*")) == before
+    assert Path(f"{folder}.out").read_text() == "imported:\n"
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_all_commands_that_import_torch_are_tried():

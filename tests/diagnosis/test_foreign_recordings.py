@@ -97,10 +97,11 @@ def test_friction_and_damping_of_a_swung_up_pendulum_are_found(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "effects", [pytest.param((), marks=pytest.mark.slow, id="all"), pytest.param(RIVALS_OF_DRAG, id="rivals")]
+    ("effects", "throws"),
+    [pytest.param((), 3, marks=pytest.mark.slow, id="all"), pytest.param(RIVALS_OF_DRAG, 2, id="rivals")],
 )
-def test_drag_of_a_ball_that_is_tracked_by_position_is_found(tmp_path, effects):
-    recording = read(thrown_ball, tmp_path)
+def test_drag_of_a_ball_that_is_tracked_by_position_is_found(tmp_path, effects, throws):
+    recording = read_csv(write_csv(thrown_ball(throws=throws), tmp_path / "ball"))
     assert recording.scene.count("framequat") == BALL.count("framequat") == 0
     found = diagnosed(recording, effects=effects)
     assert found.groups == (("air_drag",),)

@@ -47,7 +47,7 @@ def training(folder: Path, *more: str) -> list[str]:
     options = f"{folder}/demo.h5 --model {folder}/model.toml --events {folder}/events.json --out {folder}/run"
     options += " --device cpu --worlds 4 --iterations 1 --ppo.steps 4 --ppo.hidden 16 --environment.reset.states 8"
     options += " --environment.reset.turn 0 --environment.action.gripper-actuators grip --environment.episode 0.5"
-    options += " --stress.every 0"
+    options += " --environment.edges.count 0 --environment.virtual.points 0 --stress.every 0"
     return ["train", *options.split(), *more]
 
 

@@ -1,5 +1,6 @@
 """Contacts that do not fit the buffers are said at once, and training and evaluation go on with larger ones."""
 
+import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -46,10 +47,19 @@ def trained(run: TrainingRun, folder: Path | None, **options):
     return trainer, [str(one.message) for one in caught if "dropped" in str(one.message)]
 
 
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory: pytest.TempPathFactory):
+    """Return the folder of a training that began with room for one contact, its trainer and what it said."""
+    folder = tmp_path_factory.mktemp("grown")
+    return folder, *trained(made(1, 200, 8), folder)
+
+
 @pytest.mark.parametrize(("contacts", "constraints"), [(1, 200), pytest.param(60, 4, marks=pytest.mark.slow)])
-def test_training_goes_on_with_larger_buffers_and_says_so(tmp_path, contacts, constraints):
-    trainer, said = trained(made(contacts, constraints, 8), tmp_path)
-    shares = [point["overflow"] for point in read_curve(tmp_path)]
+def test_training_goes_on_with_larger_buffers_and_says_so(grown, tmp_path, contacts, constraints):
+    folder, trainer, said = grown
+    if (contacts, constraints) != (1, 200):
+        folder, (trainer, said) = tmp_path, trained(made(contacts, constraints, 8), tmp_path)
+    shares = [point["overflow"] for point in read_curve(folder)]
     assert len(shares) == 8
     assert shares[0] > 0
     assert shares[-1] == 0
@@ -81,14 +91,14 @@ def test_larger_buffers_change_nothing_else():
         assert torch.equal(value, weights[1][name])
 
 
-def test_resumed_training_has_the_larger_buffers(tmp_path):
-    trainer, said = trained(made(1, 200, 6), tmp_path)
+def test_resumed_training_has_the_larger_buffers(grown, tmp_path):
+    folder, trainer, said = grown
     assert said
-    more = made(1, 200, 7)
-    resumed, said = trained(more, tmp_path, resume=True)
+    shutil.copytree(folder, tmp_path / "run")
+    resumed, said = trained(made(1, 200, 9), tmp_path / "run", resume=True)
     assert not said
     assert resumed.environment.buffers == trainer.environment.buffers
-    assert load_checkpoint(tmp_path / CHECKPOINT)["buffers"] == trainer.environment.buffers
+    assert load_checkpoint(tmp_path / "run" / CHECKPOINT)["buffers"] == trainer.environment.buffers
 
 
 def test_buffers_that_do_not_fit_the_memory_are_said(tmp_path, monkeypatch):
