@@ -165,6 +165,8 @@ def _unit(choice: _Choice) -> tuple[str, str]:
             return "", ""
         if 1e-3 * size <= 1.5 * max(abs(span[0]), abs(span[1])) and not 0 <= low <= high <= 100:
             return "mm", f"values from {low:.4g} to {high:.4g}"
+    elif target.quantity == "length":
+        return ("mm", f"values from {low:.4g} to {high:.4g}") if size > ROOM else ("", "")
     if span is not None and low >= -100 and high <= 100:
         return ("percent" if low >= 0 else "signed_percent"), f"values from {low:.4g} to {high:.4g}"
     return "", f"values from {low:.4g} to {high:.4g} fit no unit"
