@@ -41,7 +41,7 @@ class InitialJointsCfg:
     """Weight of equality constraints, which hold, over measurements, which have noise [-]."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class InitialReadings:
     """First readings of sensors that may tell joints of other names: values by sensor, as far as they are known."""
 
