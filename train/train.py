@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +13,7 @@ from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import RunFolder, plain, run_folder, write_settings
-from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.cfg import ALL, LAST, TrainCfg
 from concent_warp.train.learning.best_policy import chosen_weights
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
@@ -106,6 +107,8 @@ def train(
             return claimed.commit()
 
         run = TrainingRun.new(model, recording, cfg, demonstration=name, events=sequence)
+        if process.is_rank_zero:
+            _warn_of_push(run)
         trainer, _ = train_run(
             run,
             path,
@@ -118,3 +121,17 @@ def train(
             begun=None if claimed is None else begin,
         )
     return Policy(run, chosen_weights(trainer.weights()), folder or Path())
+
+
+def _warn_of_push(run: TrainingRun) -> None:
+    """Warn if the trained task ends with a push, whose target is the touch of the robot alone."""
+    stages, name = run.events.stages, run.cfg.environment.stage
+    ends = stages[-1:] if name in (ALL, LAST) else [stage for stage in stages if stage.name == name]
+    for stage in ends:
+        if stage.bodies[0] == "robot" and stage.name.startswith("contact "):
+            pushed = stage.bodies[1]
+            warnings.warn(
+                f"stage {stage.name!r} counts as done when the robot touches {pushed!r} as demonstrated, wherever that "
+                f"is then; if it is to get somewhere, list what it meets there under concent_objects",
+                stacklevel=3,
+            )

@@ -78,6 +78,16 @@ class Residual:
         return self.error if self.weight is None else self.error * self.weight
 
     @property
+    def moves(self) -> bool:
+        """Whether the measured values move by more than noise alone spans; true where the noise is not known.
+
+        The extremes of n normal deviates are, in most cases, within sqrt(2 ln n) standard deviations.
+        """
+        count, dim = int(np.isfinite(self.error).sum()), self.value.shape[1]
+        spanned = 2 * np.sqrt(2 * dim * np.log(max(count, 2)))
+        return self.std is None or self.extent > spanned * self.std
+
+    @property
     def ratio(self) -> np.ndarray | None:
         """Error over noise [-], shape (T,); root mean square 1 where only noise is left. None without noise."""
         return self.weighted / self.noise if self.noise else None

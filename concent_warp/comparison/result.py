@@ -232,11 +232,15 @@ class Comparison:
         """Return the channel that says most of the objects' motion.
 
         The position of a body, of points, or anything measured, in this order of preference; among several the one with
-        the largest error before, over the contact phases.
+        the largest error before, over the contact phases. Positions and orientations that do not move come last: the
+        origin of a lever stays where it is.
         """
-        kinds = {r.channel: r.kind for d in self.demonstrations for r in self.residuals[self.before, d]}
-        for kind in ("position", "points", "orientation", "joint", "other"):
-            if channels := [c for c in self.channels if kinds[c] == kind]:
+        every = [r for d in self.demonstrations for r in self.residuals[self.before, d]]
+        kinds, moving = {r.channel: r.kind for r in every}, {r.channel for r in every if r.moves}
+        objects = ("position", "points", "orientation")
+        choices = [(kind, moving) for kind in objects] + [(kind, kinds.keys()) for kind in (*objects, "joint", "other")]
+        for kind, among in choices:
+            if channels := [c for c in self.channels if kinds[c] == kind and c in among]:
                 errors = [self.summarise(self.before, c, self.contact_phases()).mean for c in channels]
                 return channels[int(np.argmax(np.nan_to_num(errors, nan=-1, posinf=np.finfo(float).max)))]
         raise RecordingError("nothing was measured that could be compared with a model")

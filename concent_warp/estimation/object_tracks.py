@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from concent_warp.checks import Count
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.jointed_pose import jointed_pose
 from concent_warp.perception.rigid_motion import kabsch
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
@@ -85,8 +86,8 @@ def whole_demonstration(
         raise RecordingError(
             "nothing to fit to",
             where=demonstration.name,
-            expected=f"points, or position and orientation sensors, of one of {movable}",
-            fix="record /points/<body> or the body's pose",
+            expected=f"points, position and orientation, or all joints, of one of {movable}",
+            fix="record /points/<body>, the body's pose, or the positions of the passive joints on which it moves",
         )
     joints = _joint_channels(model, demonstration)
     return Segment(demonstration.name, qpos, qvel, commands(model, demonstration, steps), tuple(targets), joints)
@@ -95,7 +96,10 @@ def whole_demonstration(
 def body_target(
     scene: Scene, demonstration: Demonstration, body: str, qpos: np.ndarray, cfg: ObjectTrackCfg | None = None
 ) -> BodyTarget | None:
-    """Return the observed points of a body: tracked ones, else its surface carried by its measured pose, else None."""
+    """Return the observed points of a body: tracked ones, else its surface carried by its measured pose, else None.
+
+    The pose is that of its sensors, or of the sensors of the passive joints on which it moves.
+    """
     cfg = cfg or ObjectTrackCfg()
     data = mujoco.MjData(scene.model)
     data.qpos[:] = qpos
@@ -107,7 +111,7 @@ def body_target(
         anchor = (_resting_mean(points, cfg.rest_displacement) - origin) @ rotation
         known = np.isfinite(anchor).all(axis=1)
         return BodyTarget(body, anchor[known], track.time, points[:, known])
-    pose = measured_pose(scene.model, demonstration, body)
+    pose = measured_pose(scene.model, demonstration, body) or jointed_pose(scene.model, demonstration, body)
     if pose is None:
         return None
     time, position, turn = pose

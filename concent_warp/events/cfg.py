@@ -79,7 +79,8 @@ class StagingCfg:
     max_net_force_ratio: Share = 0.5
     """The robot grasps an object when its forces on it add up to less than this share of their magnitudes [-]."""
     min_displacement: float = 0.005
-    """An object that the robot touches without grasping it opens a stage if it is moved by more than this [m]."""
+    """An object that the robot touches without grasping it opens a stage if a touched point of it moves by more than
+    this [m]."""
     approach_length: float = 0.01
     """Length of path before the first contact of two objects from which the direction of approach is taken [m]."""
     inside_depth: float = 0.003

@@ -19,8 +19,9 @@ def robot_onsets(
     The links of the robot count as one. A contact with an object is a grasp if the robot's normal forces on it add up
     to less than `max_net_force_ratio` of the sum of their magnitudes, over windows, for `min_state_duration`: then they
     press from opposite sides, or a suction cup draws the object that it presses. It begins with the first touch of that
-    contact. Any other contact counts if it moves the object by `min_displacement`, and as long as the robot has not
-    grasped this object: touching it after its release opens no stage.
+    contact. Any other contact counts if it moves what it touches of the object by `min_displacement`, as a lever turns
+    about its own origin, and as long as the robot has not grasped this object: touching it after its release opens no
+    stage.
     """
     max_gap, shortest = steps_of(cfg.max_gap, motion.timestep), steps_of(cfg.min_contact_duration, motion.timestep)
     grasp, width = steps_of(cfg.min_state_duration, motion.timestep), steps_of(cfg.window, motion.timestep)
@@ -39,7 +40,7 @@ def robot_onsets(
             if grasping[start:end].any():
                 kind = "pick"
                 grasped[body][start:end] = True
-            elif np.linalg.norm(motion.position[end - 1, body] - motion.position[start, body]) > cfg.min_displacement:
+            elif _displacement(rows[(rows.step >= start) & (rows.step < end)], motion, body) > cfg.min_displacement:
                 kind = "push"
             else:
                 continue
@@ -47,6 +48,24 @@ def robot_onsets(
                 onsets.append(Onset(kind, int(start), (None, body), grasping if kind == "pick" else touching))
             seen.add(kind)
     return onsets, grasped
+
+
+def _displacement(rows: ReplayContacts, motion: BodyPoses, body: int) -> float:
+    """Return how far a contact with an object displaces a touched point of it, between any two of its steps [m].
+
+    Args:
+        rows: The contact, with the object as its second body.
+        motion: Poses at every step.
+        body: The object.
+    """
+    if not len(rows.step):
+        return 0.0
+    first, last = int(rows.step.min()), int(rows.step.max())
+    local = motion.into(body, rows.step, rows.point)
+    corners = np.unique(np.concatenate([local.argmin(axis=0), local.argmax(axis=0)]))
+    position, rotation = motion.position[first : last + 1, body], motion.rotation[first : last + 1, body]
+    path = position[:, None] + np.einsum("kij,cj->kci", rotation, local[corners])
+    return float(np.linalg.norm(path - path[0], axis=2).max())
 
 
 def forces_cancel(rows: ReplayContacts, steps: int, width: int, share: float) -> np.ndarray:

@@ -18,6 +18,8 @@ from concent_warp.scene.trial_compile import try_compile
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 1.0
 """Time steps [s] within which a simulation of contacts makes sense: from a hundredth of the finest that are used to the
 one in which a falling object passes through 10 m."""
+MOST_GRAVITY = 100.0
+"""Gravity that no robot meets [m/s^2]: four times Jupiter's, and a tenth of the Earth's in cm/s^2."""
 CHECKED_FIELDS = (
     "qpos0", "body_pos", "body_quat", "body_mass", "body_inertia", "geom_pos", "geom_quat", "geom_size",
     "geom_friction", "jnt_pos", "jnt_axis", "jnt_range", "jnt_stiffness", "dof_damping", "dof_armature",
@@ -93,6 +95,14 @@ def check_compiled(model: mujoco.MjModel, source: object) -> None:
         )
     if not np.isfinite([*model.opt.gravity, *model.opt.wind, model.opt.density, model.opt.viscosity]).all():
         raise SceneError("gravity or the medium of the scene is not finite", where=source, found=model.opt.gravity)
+    if (gravity := float(np.linalg.norm(model.opt.gravity))) > MOST_GRAVITY:
+        raise SceneError(
+            "the gravity of the scene is that of another unit of length",
+            where=source,
+            expected=f"m/s^2, at most {MOST_GRAVITY:g}",
+            found=f"{gravity:g}",
+            fix="write the scene, meshes included, in metres, kilograms and seconds",
+        )
     for name in CHECKED_FIELDS:
         if np.isnan(getattr(model, name)).any():
             raise SceneError(f"the scene holds NaN in {name}", where=source, expected="numbers")

@@ -12,6 +12,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.engine import Contacts, Engine, Rollout, Variants
+from concent_warp.simulate.initial_joints import FRAMES, LENGTHS, InitialReadings, with_unmeasured_joints
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,7 +74,8 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
     """Return the state at time 0, qpos (nq,) and qvel (nv,).
 
     What the recording does not say is taken from the first valid sample of joint and frame sensors, of positions for
-    each component, else from the model's reference pose; velocities are then zero.
+    each component, and of joints without a sensor from what else tells them (`with_unmeasured_joints`), else from the
+    model's reference pose; velocities are then zero.
     """
     if demonstration.qpos is not None and len(demonstration.qpos) != model.nq:
         raise RecordingError(
@@ -94,6 +96,8 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
         return np.array(demonstration.qpos, dtype=float), qvel
     qpos = model.qpos0.copy()
     framed: list[tuple[int, SensorFrame, np.ndarray]] = []
+    joints: list[int] = []
+    others = InitialReadings()
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
         known = np.isfinite(channel.value)
@@ -103,10 +107,18 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
         kind = mujoco.mjtSensor(int(model.sensor_type[row]))
         if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
             qpos[model.jnt_qposadr[model.sensor_objid[row]]] = first[0, 0]
+            joints.append(int(model.sensor_objid[row]))
+            continue
+        if int(kind) in LENGTHS:
+            others.length.append((row, float(first[0, 0])))
             continue
         frame = sensor_frame(model, row)
-        joint = -1 if frame is None else model.body_jntadr[frame.body]
-        if frame is None or joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        if frame is None or int(kind) not in FRAMES:
+            continue
+        joint = model.body_jntadr[frame.body]
+        if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+            if len(first):
+                (others.place if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS else others.turn).append((frame, first[0]))
             continue
         address = int(model.jnt_qposadr[joint])
         if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
@@ -120,7 +132,7 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
         place = frame.place_in_world(value) - turned.apply(frame.offset)
         seen = np.isfinite(place)
         qpos[address : address + 3][seen] = place[seen]
-    return qpos, qvel
+    return with_unmeasured_joints(model, qpos, joints, others), qvel
 
 
 def replay(

@@ -130,6 +130,15 @@ def test_main_channel_is_a_body_position_before_a_joint(comparison):
     assert comparison.main_channel() == "cart"
 
 
+@pytest.mark.parametrize(("extent", "expected"), [(1e-4, "turn"), (0.1, "cart")])
+def test_main_channel_of_a_body_whose_origin_stays_is_its_orientation(comparison, extent, expected):
+    residuals = {}
+    for key, found in comparison.residuals.items():
+        cart = replace(next(r for r in found if r.channel == "cart"), extent=extent, std=1e-4)
+        residuals[key] = (cart, replace(cart, channel="turn", kind="orientation", unit="rad", extent=0.5))
+    assert replace(comparison, residuals=residuals).main_channel() == expected
+
+
 def test_json_is_valid_and_has_every_channel_phase_and_model(comparison):
     document = json.loads(json.dumps(comparison.to_json(), allow_nan=False))
     keys = {(s["model"], s["channel"], s["phase"]) for s in document["summaries"]}

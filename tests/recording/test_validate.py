@@ -251,6 +251,14 @@ def test_a_recording_of_heights_alone_is_read(recording):
     assert not is_sound(only(recording, measured={"block_position": in_millimetres}))
 
 
+def test_a_slide_without_limits_is_in_metres():
+    rail = """<mujoco><worldbody><body><joint name="rail" type="slide"/><geom size="0.1"/></body></worldbody>
+    <sensor><jointpos name="rail" joint="rail"/></sensor></mujoco>"""
+    for size, sound in ((0.3, True), (300.0, False)):
+        reading = Channel(np.arange(20) * 0.1, np.full((20, 1), -size))
+        assert is_sound(Recording(rail, (Demonstration("demo_0", measured={"rail": reading}),))) == sound
+
+
 SLOW, LONG = np.arange(40) * 2.0, np.arange(800) * 0.1
 SOUND = {
     "a block that falls for five seconds": {"block_position": Channel(LONG / 16, falling(LONG / 16))},

@@ -273,3 +273,11 @@ def test_selection_without_spheres_is_refused(geometry):
     lone = ContactGeometryCfg(count=1, radius=1e-4).build(SCENE, ["block"])
     with pytest.raises(ModelError, match="no sphere"):
         offset_normal(lone, SCENE, 1e-3, lambda _, n: n @ -np.sign(lone.position[0]) > 0.9, body="block", slack=0)
+
+
+def test_an_object_in_millimetres_is_refused():
+    scene = Scene("<mujoco><worldbody><body name='cup'><freejoint/><geom size='45'/></body></worldbody></mujoco>")
+    with pytest.raises(
+        SceneError, match=r"'cup' is larger .* at most 10 m, found 90 m; .* scale=\"0.001 0.001 0.001\""
+    ):
+        ContactGeometryCfg(count=8, candidates=5000).build(scene)

@@ -32,6 +32,7 @@ def read(text: str, form: str) -> Scene:
 
 HOSTILE = {
     "negative time step": (mjcf('<option timestep="-1"/>'), "time step .* expected 1e-06 to 1 s, found -1"),
+    "millimetres": (mjcf('<option gravity="0 0 -9810"/>'), r"gravity .* expected m/s\^2, at most 100, found 9810"),
     "time step 0": (mjcf('<option timestep="0"/>'), "time step of the scene makes no sense"),
     "time step 1e300": (mjcf('<option timestep="1e300"/>'), "time step of the scene makes no sense"),
     "time step 1e-9": (mjcf('<option timestep="1e-9"/>'), "time step of the scene makes no sense"),

@@ -12,10 +12,11 @@ from concent_warp.errors import TrainError
 from concent_warp.events.sequence import ContactEvent, ContactInterval, ContactPair, Entity
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
-from concent_warp.train.cfg import ALL, LAST, ActionCfg
+from concent_warp.train.cfg import ALL, LAST, ActionCfg, TrainCfg
 from concent_warp.train.task.movable_fixtures import mocap_id, with_movable_fixtures
 from concent_warp.train.task.robot import Robot, _opening
 from concent_warp.train.task.task import Replay, Task, _chain, _objects_by_handling, _replay, _target_position
+from concent_warp.train.train import _warn_of_push
 
 ARM = """
 <mujoco>
@@ -144,6 +145,31 @@ def test_grippers_that_are_no_lengths_step_by_a_share_of_their_range():
         Robot.of(arm(PLAIN + cup + '<position name="finger" joint="a"/>'), both)
 
 
+def test_turning_fingers_whose_range_is_in_degrees_are_refused():
+    cfg = ActionCfg(gripper_actuators=("turn",))
+    limited = arm('<position name="turn" joint="turn" ctrlrange="-40 40"/>')
+    limited.jnt_limited[1], limited.jnt_range[1] = 1, (-0.7, 0.7)
+    with pytest.raises(TrainError, match=r"'turn' is far beyond its joint.*-0.7 to 0.7, found -40 to 40; write rad"):
+        Robot.of(limited, cfg)
+    limited.actuator_ctrlrange[0] = -1.5, 1.5  # closes with force
+    assert Robot.of(limited, cfg).step[-1] == pytest.approx(3 * cfg.gripper_share)
+
+
+@pytest.mark.parametrize(("bodies", "name", "warned"), [
+    (("robot", "block"), "contact robot-block", True),
+    (("robot", "block"), "pick", False),
+    (("block", "box"), "contact block-box", False),
+])  # fmt: skip
+def test_a_task_that_ends_with_a_push_is_warned_of(bodies, name, warned, recwarn):
+    first, *_ = make_events().stages
+    stages = (replace(first, bodies=bodies, name=name),)
+    run = SimpleNamespace(events=replace(make_events(), stages=stages), cfg=TrainCfg())
+    _warn_of_push(run)  # type: ignore[arg-type]
+    assert [str(w.message)[:70] for w in recwarn] == [
+        "stage 'contact robot-block' counts as done when the robot touches 'blo"
+    ] * warned
+
+
 def test_a_gripper_that_is_named_must_be_there():
     with pytest.raises(TrainError, match=r"no actuator 'jaws'; found \['slide', 'turn'\].*gripper-actuators"):
         Robot.of(arm(), ActionCfg(gripper_actuators=("slide", "jaws")))
@@ -199,8 +225,9 @@ def test_chain_is_of_all_stages_or_of_one():
     assert [_chain(events, name) for name in ("pick", "align", "insert")] == [(0, 0), (1, 1), (2, 2)]
     with pytest.raises(TrainError, match=r"no such stage.*\['pick', 'align', 'insert', 'last', 'all'\].*fly"):
         _chain(events, "fly")
-    with pytest.raises(TrainError, match=r"\['last', 'all'\].*all"):
-        _chain(replace(events, stages=()), ALL)
+    for name in (ALL, LAST, "pick"):
+        with pytest.raises(TrainError, match=r"no stage to train.*begins during it.*from before the first contact"):
+            _chain(replace(events, stages=()), name)
     assert make_task().chained == (0, 1, 2)
     assert make_task(first=1).chained == (1, 2)
     assert make_task(first=2).chained == (2,)

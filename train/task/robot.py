@@ -148,6 +148,7 @@ def _gripper_step(m: mujoco.MjModel, gripper: list[int], cfg: ActionCfg) -> tupl
         if _takes_position(m, i) and not turns:
             steps[name] = cfg.gripper, True
         elif m.actuator_ctrllimited[i]:
+            _check_angles(m, i)
             steps[name] = cfg.gripper_share * float(np.ptp(m.actuator_ctrlrange[i])), False
         else:
             raise TrainError(
@@ -161,6 +162,25 @@ def _gripper_step(m: mujoco.MjModel, gripper: list[int], cfg: ActionCfg) -> tupl
             fix="give them the same kind of command and the same ctrlrange, or couple them by one tendon",
         )
     return next(iter(steps.values()), (cfg.gripper, True))
+
+
+def _check_angles(m: mujoco.MjModel, i: int) -> None:
+    """Check that the range of a gripper's servo is not in degrees, which MuJoCo takes for radians.
+
+    Raises:
+        TrainError: The range begins or ends more than a turn outside that of the hinge.
+    """
+    joint = int(m.actuator_trnid[i, 0])
+    if not _takes_position(m, i) or int(m.actuator_trntype[i]) not in JOINTS or not m.jnt_limited[joint]:
+        return
+    (low, high), commands = m.jnt_range[joint], m.actuator_ctrlrange[i]
+    if commands[0] < low - 2 * np.pi or commands[1] > high + 2 * np.pi:
+        raise TrainError(
+            f"the ctrlrange of the gripper's actuator {m.actuator(i).name!r} is far beyond its joint, as if in degrees",
+            expected=f"rad, about {low:.4g} to {high:.4g}",
+            found=f"{commands[0]:g} to {commands[1]:g}",
+            fix="write radians, which <compiler angle> does not do for ctrlrange, or inheritrange='1'",
+        )
 
 
 def _opening(m: mujoco.MjModel, gripper: list[int]) -> np.ndarray:

@@ -164,6 +164,14 @@ def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
         TrainError: The demonstration has no such stage.
     """
     names = [stage.name for stage in events.stages]
+    if not names:
+        raise TrainError(
+            "the demonstration has no stage to train",
+            where=events.demonstration,
+            expected="a grasp, a push by the robot, or a contact of two objects that begins during it",
+            found=_unstaged(events),
+            fix="record from before the first contact; check what concent events prints, and concent_objects",
+        )
     if name == ALL and names:
         return 0, len(names) - 1
     if name == LAST and names:
@@ -171,6 +179,12 @@ def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
     if name not in names:
         raise TrainError("the demonstration has no such stage", expected=f"one of {[*names, LAST, ALL]}", found=name)
     return names.index(name), names.index(name)
+
+
+def _unstaged(events: ContactEventSequence) -> str:
+    """Return what contacts there are of a sequence without stages."""
+    shown = [f"{one.a} and {one.b} from {one.start:.2f} s" for one in events.body_contacts]
+    return f"{', '.join(shown[:4])}{' and more' if len(shown) > 4 else ''}" or "no contacts"
 
 
 def _objects_by_handling(model: Model, events: ContactEventSequence) -> list[str]:

@@ -110,6 +110,9 @@ def converted(
             found=[signal.name for signal in signals],
         )  # fmt: skip
     raw = np.stack([signal.value for signal in signals], axis=1)
+    if first.sparse:
+        filled = np.isfinite(raw).any(axis=1)
+        first, raw = replace(first, time=first.time[filled], value=first.value[filled]), raw[filled]
     time, kept, repeated = clean_times(first, clocks[0], cfg)
     value = _in_si(raw[kept], entry, target, where)
     if target.command:

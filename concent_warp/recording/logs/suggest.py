@@ -8,14 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.logs.import_log import Source, scene_of
+from concent_warp.recording.logs.pose_columns import pose_columns
 from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
+from concent_warp.recording.logs.units import UNITS
 from concent_warp.scene.scene import Scene
 
 WORDS = {
@@ -25,8 +28,13 @@ WORDS = {
 }
 """Words that name a quantity and not a joint."""
 FILLERS = ("observation", "action", "joint", "joints", "states", "command", "commands", "cmd", "goal", "data", "motor",
-           "main", "follower", "leader", "actuator", "sensor", "measured", "servo")  # fmt: skip
+           "main", "follower", "leader", "actuator", "sensor", "measured", "servo", "target", "setpoint", "desired",
+           "actual")  # fmt: skip
 """Words that do not tell one joint from another."""
+NAMED_UNITS = ("rad", "deg", "m", "cm", "mm", "um", "inch", "percent")
+"""Units that the last word of a name may state."""
+ROOM = 20.0
+"""Distance of a body from the origin above which positions are guessed to be in millimetres [m]."""
 MAX_DEGREES = 720.0
 """Largest value that is guessed to be an angle in degrees [deg]."""
 
@@ -73,10 +81,13 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     poses = sorted({n.removesuffix("/orientation/w") for n in found.signals if n.endswith("/orientation/w")})
     poses = [one for one in poses if f"{one}/position/x" in found.signals]
     lines += _bodies(bodies, poses)
+    columns, written = _pose_columns(m, bodies, [one for one in found.signals.values() if one not in commands])
+    lines += [] if poses else columns
     lines += _images(found)
     used = {one.signal.name for one in (*chosen, *measured)} | {
         name for name in found.signals if name.startswith(tuple(f"{pose}/" for pose in poses))
     }
+    used |= set() if poses else written
     if left := [name for name in found.signals if name not in used]:
         lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
     return "\n".join(lines).rstrip() + "\n"
@@ -136,22 +147,26 @@ def _unit(choice: _Choice) -> tuple[str, str]:
     if not value.size or not target.position:
         return "", ""
     low, high = float(value.min()), float(value.max())
-    span = target.range
+    size, span = max(abs(low), abs(high)), target.range
+    if (named := _named_unit(choice.signal.name)) and UNITS.get(named, (target.quantity,))[0] == target.quantity:
+        return ("" if named in ("rad", "m") else named), ""
     if target.quantity == "angle":
         inside = span is None or (low >= span[0] - 0.35 and high <= span[1] + 0.35)
-        if inside and max(abs(low), abs(high)) <= 4 * math.pi:
+        if inside and size <= 4 * math.pi:
             return "", ""
         factor = math.pi / 180
-        if max(abs(low), abs(high)) <= MAX_DEGREES and (
+        if size <= MAX_DEGREES and (
             span is None or (low * factor >= span[0] - 0.35 and high * factor <= span[1] + 0.35)
         ):
             percent = ", may be a percentage" if low >= -100 and high <= 100 else ""
             return "deg", f"values from {low:.4g} to {high:.4g}{percent}"
     elif target.quantity == "length" and span is not None:
-        if high <= 1.5 * max(abs(span[0]), abs(span[1])):
+        if size <= 1.5 * max(abs(span[0]), abs(span[1])):
             return "", ""
-        if 1e-3 * high <= 1.5 * max(abs(span[0]), abs(span[1])) and not 0 <= low <= high <= 100:
+        if 1e-3 * size <= 1.5 * max(abs(span[0]), abs(span[1])) and not 0 <= low <= high <= 100:
             return "mm", f"values from {low:.4g} to {high:.4g}"
+    elif target.quantity == "length":
+        return ("mm", f"values from {low:.4g} to {high:.4g}") if size > ROOM else ("", "")
     if span is not None and low >= -100 and high <= 100:
         return ("percent" if low >= 0 else "signed_percent"), f"values from {low:.4g} to {high:.4g}"
     return "", f"values from {low:.4g} to {high:.4g} fit no unit"
@@ -169,6 +184,40 @@ def _bodies(bodies: Sequence[str], poses: Sequence[str]) -> list[str]:
             free.remove(hit)
             lines += [f"[body.{_quoted(body)}]{guess}", f"source = {_text(hit)}", ""]
     return lines
+
+
+def _pose_columns(m: mujoco.MjModel, bodies: Sequence[str], signals: Sequence[Signal]) -> tuple[list[str], set[str]]:
+    """Return the lines of bodies whose poses are columns of their own, and the channels that these name."""
+    lines: list[str] = []
+    used: set[str] = set()
+    by_name = {one.name: one for one in signals}
+    free = pose_columns(by_name)
+    for body in bodies:
+        hit = next((one for one in free if _key(body) and _key(body) in _key(one.body)), None)
+        guess = ""
+        if hit is None and len(bodies) == len(free) == 1:
+            hit, guess = free[0], "  # guess: the only pose"
+        if hit is None:
+            continue
+        free.remove(hit)
+        far = [float(np.nanmax(np.abs(by_name[name].value), initial=0.0)) for name in hit.position]
+        unit = hit.unit or ("mm" if max(far) > ROOM else "")
+        if unit and not hit.unit:
+            guess = f"  # guess: values up to {max(far):.4g}"
+        place, turn = body_sensors(m, body)
+        assert place is not None
+        assert turn is not None
+        lines += [f"[measured.{_quoted(place)}]{guess}", f"source = {_text(list(hit.position))}"]
+        lines += [f"unit = {_text(unit)}"] if unit not in ("", "m") else []
+        lines += ["", f"[measured.{_quoted(turn)}]", f"source = {_text(list(hit.orientation))}", 'order = "wxyz"', ""]
+        used |= {*hit.position, *hit.orientation}
+    return lines, used
+
+
+def _named_unit(name: str) -> str:
+    """Return the unit that the last word of a name states; empty without one."""
+    words = _words(name)
+    return words[-1] if len(words) > 1 and words[-1] in NAMED_UNITS else ""
 
 
 def _images(episode: Episode) -> list[str]:
@@ -209,11 +258,13 @@ def _words(name: str) -> list[str]:
 def _key(name: str) -> str:
     """Return what tells one joint from another in a name."""
     quantities = {word for words in WORDS.values() for word in words}
-    kept = [word for word in _words(name) if word not in quantities and word not in FILLERS]
+    words = _words(name)
+    words = words[:-1] if len(words) > 1 and words[-1] in NAMED_UNITS else words
+    kept = [word for word in words if word not in quantities and word not in FILLERS]
     return "_".join(kept)
 
 
-def _text(value: str) -> str:
+def _text(value: str | list[str]) -> str:
     """Return a text as TOML."""
     import json
 

@@ -8,7 +8,7 @@ The bounds (`UnitCheckCfg`) are far outside the values of a sound recording, and
 - joint angles, and those commanded of a position servo: more than `max_turn` outside the joint's range. Angles of
   joints without limits cannot be judged and are not.
 - joint slides, commanded or measured: more than `max_slide`, and more than `max_slide_ranges` times the range, outside
-  the joint's range.
+  the joint's range; without limits, as distances from the origin.
 - tendons over joints of one kind: the same, with the range that the joints give them.
 - speeds: above `max_speed`.
 """
@@ -112,6 +112,8 @@ def _check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, place: Er
     if model.jnt_limited[joint]:
         low, high = (float(bound) for bound in model.jnt_range[joint])
         _check_range(value, low, high, int(model.jnt_type[joint]), f"joint {model.joint(joint).name!r}", place, cfg)
+    elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+        check_lengths(np.abs(value), model, place, cfg)
 
 
 def _check_tendon(

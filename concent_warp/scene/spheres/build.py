@@ -16,6 +16,7 @@ import numpy as np
 from concent_warp.checks import Bounds, Share, check_settings
 from concent_warp.errors import ModelError, SceneError
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.shapes.objects import MAX_EXTENT
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from concent_warp.scene.spheres.edges import edge_spheres
@@ -131,6 +132,14 @@ class ContactGeometryCfg:
         """Return `count` spheres on one body."""
         wanted = self.radius if self.radius != "auto" else _spacing(surface.area, count) / 2
         surface_points, _ = surface.sample(max(self.candidates, count), rng)
+        if (extent := float(np.ptp(surface_points, axis=0).max())) > MAX_EXTENT:
+            raise SceneError(
+                f"body {name!r} is larger than what a robot handles, as if in millimetres",
+                where=scene.source,
+                expected=f"at most {MAX_EXTENT:g} m",
+                found=f"{extent:.3g} m",
+                fix='write sizes in metres, and scale="0.001 0.001 0.001" for a <mesh> in millimetres',
+            )
         points, radius = surface_points, np.full(len(surface_points), wanted)
         if self.placement == "inset":
             points, radius = inset(surface, points, wanted, self.inset)

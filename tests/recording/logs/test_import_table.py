@@ -8,6 +8,7 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.logs.import_log import import_log
+from concent_warp.recording.logs.pose_columns import pose_columns
 from concent_warp.recording.logs.readers.csv_table import table_signals
 from concent_warp.recording.logs.readers.kinds import log_sources
 from concent_warp.recording.logs.suggest import suggest_map
@@ -15,8 +16,8 @@ from concent_warp.recording.logs.suggest import suggest_map
 SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-2 2"/><geom size="0.1" mass="1"/></body>
 <body name="block" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody>
 <actuator><position name="hinge" joint="hinge" kp="5"/></actuator>
-<sensor><jointpos name="hinge_position" joint="hinge"/><framepos name="block_position" objtype="body" objname="block"/>
-<framequat name="block_orientation" objtype="body" objname="block"/></sensor></mujoco>"""
+<sensor><jointpos name="hinge_position" joint="hinge"/><framepos name="block_position" objtype="xbody" objname="block"/>
+<framequat name="block_orientation" objtype="xbody" objname="block"/></sensor></mujoco>"""
 MAP = """[action.hinge]
 source = "cmd_hinge"
 unit = "deg"
@@ -59,6 +60,68 @@ def test_a_map_is_suggested_from_the_names_of_columns(folder):
     text = suggest_map(folder / "log.csv", folder / "robot.xml")
     assert 'source = "cmd_hinge"\nunit = "deg"' in text
     assert 'source = "hinge"\nunit = "deg"' in text
+    assert '[measured.block_position]  # guess: the only pose\nsource = ["x", "y", "z"]\n' in text
+    assert '[measured.block_orientation]\nsource = ["qw", "qx", "qy", "qz"]\norder = "wxyz"\n' in text
+
+
+@pytest.mark.parametrize(
+    ("position", "orientation", "unit"),
+    [
+        (["cup_x", "cup_y", "cup_z"], ["cup_qw", "cup_qx", "cup_qy", "cup_qz"], ""),
+        (["cup_px_mm", "cup_py_mm", "cup_pz_mm"], ["cup_rw", "cup_rx", "cup_ry", "cup_rz"], "mm"),
+        (["cup.pos.x", "cup.pos.y", "cup.pos.z"], ["cup.quat.w", "cup.quat.x", "cup.quat.y", "cup.quat.z"], ""),
+        (["x [m]", "y [m]", "z [m]"], ["q_w", "q_x", "q_y", "q_z"], "m"),
+    ],
+)
+def test_poses_are_found_by_the_names_of_their_columns(position, orientation, unit):
+    (found,) = pose_columns([*reversed(orientation), "flux", "cup_index", *position])
+    assert found.position == tuple(position)
+    assert found.orientation == tuple(orientation)
+    assert found.unit == unit
+    assert pose_columns(position) == pose_columns(orientation) == []
+
+
+def test_units_in_names_are_taken_and_negative_lengths_are_judged_by_their_size(tmp_path):
+    scene = SCENE.replace('name="hinge" axis="0 1 0" range="-2 2"', 'name="hinge" type="slide" range="-0.2 0.1"')
+    (tmp_path / "robot.xml").write_text(scene)
+    for ending in ("_mm", ""):
+        (tmp_path / "log.csv").write_text(f"t,hinge{ending},hinge_target{ending}\n0,-50,-50\n0.1,-55,-56\n")
+        text = suggest_map(tmp_path / "log.csv", tmp_path / "robot.xml")
+        guess = "" if ending else "  # guess: values from -56 to -50"
+        assert f'[action.hinge]{guess}\nsource = "hinge_target{ending}"\nunit = "mm"\n' in text
+        assert f'source = "hinge{ending}"\nunit = "mm"\n' in text
+
+
+def test_rows_of_two_rates_in_one_table_are_told_apart(folder):
+    arm = [f"{t:.4f},{10 * t:.3f},{10 * t:.3f},,,,,,," for t in np.arange(0, 1, 0.1)]
+    block = [f"{t:.4f},,,0.1,0,1,1,0,0,0" for t in np.arange(0, 1, 0.05)]  # every second at the stamp of an arm's row
+    rows = sorted([*arm, *block], key=lambda row: float(row.split(",")[0]))
+    (folder / "log.csv").write_text("\n".join(["t,hinge,cmd_hinge,x,y,z,qw,qx,qy,qz", *rows]))
+    (d,) = import_log(folder / "log.csv", folder / "robot.xml", mapping=folder / "map.toml").demonstrations
+    np.testing.assert_allclose(d.action["hinge"].time, np.arange(0, 1, 0.1))
+    np.testing.assert_allclose(np.degrees(d.measured["hinge_position"].value[:, 0]), 10 * np.arange(0, 1, 0.1))
+    np.testing.assert_allclose(d.measured["block_position"].time, np.arange(0, 1, 0.05))
+
+
+def test_a_folder_of_tables_without_common_columns_is_one_episode(folder):
+    run = folder / "runs" / "first"
+    run.mkdir(parents=True)
+    arm = [f"{t:.4f},{t:.3f},{t:.3f}" for t in np.arange(0, 1, 0.1)]
+    block = [f"{t:.4f},0.1,0,1,1,0,0,0" for t in np.arange(0.02, 1, 0.05)]
+    (run / "joints.csv").write_text("\n".join(["t,hinge,cmd_hinge", *arm]))
+    (run / "mocap.csv").write_text(
+        "\n".join(["time,block_x,block_y,block_z,block_qw,block_qx,block_qy,block_qz", *block])
+    )
+    text = suggest_map(run, folder / "robot.xml")
+    assert 'source = "joints/cmd_hinge"' in text
+    assert '"mocap/block_qw"' in text
+    (folder / "map.toml").write_text(text)
+    (d,) = import_log(run, folder / "robot.xml", mapping=folder / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["block_position"].time, np.arange(0.02, 1, 0.05))
+    assert log_sources(folder / "runs") == [run]
+    (run / "mocap.csv").rename(folder / "runs" / "second.csv")
+    (run / "again.csv").write_text((run / "joints.csv").read_text())
+    assert log_sources(run) == [run / "again.csv", run / "joints.csv"]
 
 
 @pytest.mark.parametrize(("name", "text"), [("t_ms", "1500"), ("time [us]", "1500000"), ("timestamp_ns", "1500000000")])

@@ -1,6 +1,7 @@
 """Tables of numbers, CSV: a header of names, a row a sample, one column of which is the time.
 
-A file by itself is a log of one episode; beside images it is a part of theirs.
+A file by itself is a log of one episode; so is a folder of files that have no column in common, as one of the joints
+and one of motion capture, and beside images a file is a part of their episode.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ TIME = re.compile(r"(?:time|timestamp|time_?stamp|stamp|t|clock)(?:[ _]?[\[(]?(s
 """Names of a column of times, with its unit."""
 UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SEPARATORS = (",", ";", "\t")
+TABLES = (".csv", ".tsv")
 
 
 class CsvTable:
@@ -38,12 +40,41 @@ class CsvTable:
     numbers: Sequence[int] = (0,)
 
     def __init__(self, path: Path) -> None:
-        """Name the file; it is read by `episode`."""
+        """Name the file, or the folder of files; they are read by `episode`."""
         self.source = Path(path)
 
     def episode(self, number: int) -> Episode:
         """See `Log.episode`."""
-        return Episode(number, table_signals(self.source), {})
+        signals: dict[str, Signal] = {}
+        for path in tables_in(self.source):
+            signals |= table_signals(path, f"{path.stem}/")
+        return Episode(number, signals or table_signals(self.source), {})
+
+
+def tables_in(folder: Path) -> list[Path]:
+    """Return the tables of a folder, in the order of their names; none of a file."""
+    if not folder.is_dir():
+        return []
+    return sorted(one for one in folder.iterdir() if one.suffix.lower() in TABLES and one.is_file())
+
+
+def is_one_episode(folder: Path) -> bool:
+    """Return whether the tables of a folder are parts of one episode: two or more without a common column of numbers.
+
+    The tables of several episodes have the same columns.
+    """
+    seen: set[str] = set()
+    tables = tables_in(folder)
+    for path in tables:
+        try:
+            header = [name.strip() for name in next(table_rows(path), (0, [""]))[1]]
+        except RecordingError:
+            return False
+        names = {name for name in header if not TIME.fullmatch(name)}
+        if len(names) == len(header) or not names or names & seen:
+            return False
+        seen |= names
+    return len(tables) > 1
 
 
 def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
@@ -88,7 +119,7 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
     for k, column in enumerate(columns):
         if k != clock and (values := column.numbers(path)) is not None:
             name = folder + column.name
-            found[name] = Signal(name, stamps, values, command=COMMAND.search(name) is not None)
+            found[name] = Signal(name, stamps, values, command=COMMAND.search(name) is not None, sparse=True)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Which kind of log a path is, from names alone."""
+"""Which kind of log a path is, from names, and from the headers of tables."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from concent_warp.errors import RecordingError
+from concent_warp.recording.logs.readers.csv_table import TABLES, is_one_episode
 
 LogKind = Literal["lerobot", "ros", "images", "bop", "table"]
 KINDS = (
@@ -14,7 +15,6 @@ KINDS = (
     "metadata.yaml), a table (.csv), a folder with intrinsics.json and folders of colour and depth images, a scene of "
     "a BOP data set (folder with scene_camera.json), or a folder of logs"
 )
-TABLES = (".csv", ".tsv")
 BAGS = (".mcap", ".bag", ".db3")
 COLOUR_FOLDERS = ("color", "colour", "rgb", "image", "images", "left")
 DEPTH_FOLDERS = ("depth", "aligned_depth", "aligned_depth_to_color", "depth_aligned")
@@ -34,7 +34,7 @@ def log_kind(path: Path) -> LogKind | None:
         folders = {one.name.lower() for one in path.iterdir() if one.is_dir()}
         if folders & {*COLOUR_FOLDERS, *DEPTH_FOLDERS} or any((path / name).exists() for name in INTRINSICS):
             return "images"
-        return None
+        return "table" if is_one_episode(path) else None
     if path.suffix.lower() in TABLES and path.exists():
         return "table"
     return "ros" if path.suffix.lower() in BAGS and path.exists() else None

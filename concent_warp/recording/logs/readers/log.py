@@ -30,6 +30,9 @@ class Signal:
     """Times at which the logger received the samples [s], shape (T,), where these differ from the stamps."""
     command: bool = False
     """Whether the log says that this is a command."""
+    sparse: bool = False
+    """Whether its samples are among those of other channels, as in a table with a row for each of either: samples
+    without a value are then none."""
 
 
 @dataclass(frozen=True)
