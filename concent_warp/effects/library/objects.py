@@ -67,7 +67,8 @@ class CenterOfMass(BodyEffect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return an offset along each axis of the body."""
         body = self.ids(m)[0]
-        size = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
+        extent = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
+        size = max(extent, _lever(m, body) / 3)
         return tuple(Parameter(axis, "m", 0.0, -3 * size, 3 * size, 0.3 * size) for axis in "xyz")
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -77,6 +78,21 @@ class CenterOfMass(BodyEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Shift it."""
         m.body_ipos[self.ids(m)] += values
+
+
+def _lever(m: mujoco.MjModel, body: int) -> float:
+    """Return the distance of the centre of mass from the body's hinges [m], 0 without any.
+
+    A small bob on a long cable is as far off as the cable may be longer.
+    """
+    found = [0.0]
+    for j in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
+        arm = m.body_ipos[body] - m.jnt_pos[j]
+        if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE:
+            found.append(float(np.linalg.norm(np.cross(m.jnt_axis[j], arm))))
+        elif m.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL:
+            found.append(float(np.linalg.norm(arm)))
+    return max(found)
 
 
 class Inertia(BodyEffect):

@@ -16,6 +16,7 @@ from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
+from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
 from concent_warp.scene.scene import Scene
 
 WORDS = {
@@ -86,7 +87,7 @@ def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
     """Return the channels of a quantity; those whose name says none count as positions."""
     found = []
     for one in signals:
-        words = _words(one.name)
+        words = words_of(one.name)
         said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
         if (said[-1] if said else "position") == quantity and not one.name.endswith(("/x", "/y", "/z", "/w")):
             found.append(one)
@@ -100,7 +101,7 @@ def _matched(targets: Sequence[Target], signals: Sequence[Signal]) -> list[_Choi
     free = list(positions or signals)
     for target in targets:
         keys = {_key(target.name), _key(target.joint)} - {""}
-        hit = next((one for one in free if _key(one.name.rpartition("/")[2]) in keys or _key(one.name) in keys), None)
+        hit = next((one for one in free if _keys(one.name) & keys), None)
         if hit is not None:
             free.remove(hit)
             found[target.name] = _Choice(target, hit)
@@ -131,6 +132,8 @@ def _section(kind: str, targets: Sequence[Target], choices: Sequence[_Choice]) -
 
 def _unit(choice: _Choice) -> tuple[str, str]:
     """Return the unit that the values suggest, and why; empty where SI fits."""
+    if unit := named_unit(choice.signal.name, choice.target.quantity):
+        return unit, ""
     value = choice.signal.value[np.isfinite(choice.signal.value)]
     target = choice.target
     if not value.size or not target.position:
@@ -190,26 +193,26 @@ def _images(episode: Episode) -> list[str]:
 
 def _alike(one: Images, other: Images) -> int:
     """Return how many words two names share."""
-    return len(set(_words(one.name)) & set(_words(other.name)))
+    return len(set(words_of(one.name)) & set(words_of(other.name)))
 
 
 def _camera_name(name: str) -> str:
     """Return a short name of a camera."""
     generic = ("color", "colour", "rgb", "image", "images", "raw", "rect", "compressed", "observation")
-    words = [word for word in _words(name) if word not in generic]
+    words = [word for word in words_of(name) if word not in generic]
     return "_".join(words) or "camera"
 
 
-def _words(name: str) -> list[str]:
-    """Return the words of a name in lower case; camelCase is parted."""
-    parted = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
-    return [word for word in re.split(r"[^a-z0-9]+", parted.lower()) if word]
+def _keys(name: str) -> set[str]:
+    """Return what may tell a channel's joint from another: all of its name, and what is behind topics or dots."""
+    return {_key(one) for one in (name, name.rpartition("/")[2], re.split(r"[/.]", name)[-1])}
 
 
 def _key(name: str) -> str:
     """Return what tells one joint from another in a name."""
     quantities = {word for words in WORDS.values() for word in words}
-    kept = [word for word in _words(name) if word not in quantities and word not in FILLERS]
+    quantities |= {*FILLERS, *NAMED, *SI_WORDS}
+    kept = [word for word in words_of(name) if word not in quantities]
     return "_".join(kept)
 
 

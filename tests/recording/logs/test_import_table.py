@@ -61,15 +61,54 @@ def test_a_map_is_suggested_from_the_names_of_columns(folder):
     assert 'source = "hinge"\nunit = "deg"' in text
 
 
-@pytest.mark.parametrize(("name", "text"), [("t_ms", "1500"), ("time [us]", "1500000"), ("timestamp_ns", "1500000000")])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t_ms", "1500"),
+        ("time [us]", "1500000"),
+        ("timestamp_ns", "1500000000"),
+        ("Time (Seconds)", "1.5"),
+        ("%time", "1.5"),
+        ("__time", "1.5"),
+        ("field.header.stamp", "1.5"),
+        ("sim_time_ms", "1500"),
+        ("timestamp", "1970-01-01 00:00:01.5"),
+        ("timestamp", "1970-01-01T01:00:01.5+01:00"),
+    ],
+)
 def test_the_name_of_the_times_may_state_their_unit(tmp_path, name, text):
     (tmp_path / "a.csv").write_text(f"a,{name}\n1,{text}\n")
     assert table_signals(tmp_path / "a.csv")["a"].time == pytest.approx([1.5])
 
 
 @pytest.mark.parametrize(
+    "names",
+    [
+        ("time_sec", "time_nsec"),
+        ("header.stamp.secs", "header.stamp.nsecs"),
+        ("/js/header.stamp.sec", "/js/header.stamp.nanosec"),
+        ("sec", "nsec"),
+        ("stamp_s", "stamp_ns"),
+    ],
+)
+def test_stamps_of_whole_seconds_and_nanoseconds_are_put_together(tmp_path, names):
+    (tmp_path / "a.csv").write_text(f"a,{names[1]},{names[0]}\n1,500000000,1700000000\n2,20,1700000001\n")
+    found = table_signals(tmp_path / "a.csv")
+    assert list(found) == ["a"]
+    np.testing.assert_array_equal(found["a"].time, [1700000000.5, 1700000001 + 2e-8])
+
+
+@pytest.mark.parametrize("rows", ["1,1500000000,1\n2,2000000000,2\n", "1.5,1500000000,1\n2.0,2000000000,2\n"])
+def test_nanoseconds_that_count_all_of_the_time_are_not_added_to_the_seconds(tmp_path, rows):
+    (tmp_path / "a.csv").write_text(f"time_s,time_ns,a\n{rows}")
+    np.testing.assert_array_equal(table_signals(tmp_path / "a.csv")["a"].time, [1.5, 2])
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("sim_time,wall_time\n1,2\n", r"several columns of a table may be the time.*rename the one that is meant"),
+        ("t,a\nyesterday,2\n", "line 2: a time is not a number; found 'yesterday'"),
         ("a,b\n1,2\n", "a table has no times; expected names in the first line, one of them time or timestamp"),
         ("t,a,a\n1,2,3\n", r"two columns of a table have the same name.*\['a'\]"),
         ("t,a\n1,2,3\n", "line 2: wrong number of columns; expected 2, found 3"),
@@ -119,3 +158,32 @@ def test_notes_in_a_folder_of_bags_are_no_log(tmp_path):
     (tmp_path / "a.mcap").unlink()
     (tmp_path / "b.mcap").unlink()
     assert [one.name for one in log_sources(tmp_path)] == ["notes.csv"]
+
+
+def test_a_unit_that_the_name_of_a_column_states_is_not_taken_for_si(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    rows = "\n".join(f"{t:.2f},{20 * np.sin(t):.5f},{0.03 * np.sin(t):.5f},1,2,{t:.2f}" for t in TIME)
+    (tmp_path / "a.csv").write_text("t,hinge_deg,cmd_hinge,p_x_mm,p_y_mm,p_z_mm\n" + rows)
+    position = '[measured.block_position]\nsource = ["p_x_mm", "p_y_mm", "p_z_mm"]\n'
+    (tmp_path / "map.toml").write_text(f'[action]\nhinge = "cmd_hinge"\n{position}')
+    with pytest.raises(RecordingError, match=r"block_position.*its name states mm, and the map no unit"):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+    (tmp_path / "map.toml").write_text(f'[action]\nhinge = "cmd_hinge"\n{position}unit = "mm"\n')
+    (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["block_position"].value[-1], [1e-3, 2e-3, TIME[-1] * 1e-3])
+
+
+def test_a_suggested_map_has_the_units_that_names_state(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "a.csv").write_text("t,seq,arm.position.hinge_deg,arm.command.hinge_deg\n0,1,2,1\n1,2,2.5,2\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert '[measured.hinge_position]\nsource = "arm.position.hinge_deg"\nunit = "deg"\n' in text
+    assert '[action.hinge]\nsource = "arm.command.hinge_deg"\nunit = "deg"\n' in text
+
+
+def test_stamps_that_stand_still_are_not_told_to_take_times_of_reception_that_a_table_has_not(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "map.toml").write_text('[action]\nhinge = "cmd"\n[measured]\nhinge_position = "q"\n')
+    (tmp_path / "a.csv").write_text("t,q,cmd\n" + "\n".join(f"{t // 1:.0f},{t},{t}" for t in TIME))
+    with pytest.raises(RecordingError, match=r"198 of 200 stamps are repeated or missing; mend the log(?!, or)"):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
