@@ -28,6 +28,9 @@ class PlausibilityCfg:
     max_clock_difference: PositiveDuration = 0.5
     """Difference between the delays of two channels, reception less stamp, above which their stamps are of two
     clocks [s]."""
+    merged_share: Share = 0.5
+    """Share of missing samples above which these are rows that a table of several rates has for other channels [-];
+    they are left out."""
     max_repeated: Share = 0.1
     """Share of samples with the stamp of another one above which a clock stands still [-]."""
     depth_bounds: tuple[float, float] = (0.02, 20.0)

@@ -39,6 +39,8 @@ class Numbers:
     """Median of reception less time [s]; None where the log has one clock."""
     repeated: int = 0
     """Samples that were dropped since another one has their stamp."""
+    empty: int = 0
+    """Rows that were dropped since they are of other channels."""
 
     @property
     def label(self) -> str:
@@ -118,17 +120,21 @@ def converted(
     raw = np.stack([signal.value for signal in signals], axis=1)
     time, kept, repeated = clean_times(first, clocks[0], cfg)
     value = _in_si(raw[kept], entry, target, where)
+    empty = 0
+    present = np.isfinite(value).any(axis=1)
     if target.command:
         finite = np.isfinite(value).all(axis=1)
         time, value = time[finite], value[finite]
+    elif present.any() and not present.all() and np.mean(~present) > cfg.merged_share:
+        empty = int((~present).sum())
+        time, value = time[present], value[present]
     if not len(time) or np.isnan(value).all():
         raise RecordingError("the channel has no samples", where=where, found=first.name, fix="leave it out of the map")
     source = first.name if len(signals) == 1 else ", ".join(signal.name for signal in signals)
     if len(signals) > 1 and len(entry.source) == 1:
         source = entry.source[0]
-    return Numbers(
-        target, source, where, time, value, entry.unit, entry.noise_std, delay_of(first, clocks[0]), repeated
-    )
+    delay = delay_of(first, clocks[0])
+    return Numbers(target, source, where, time, value, entry.unit, entry.noise_std, delay, repeated, empty)
 
 
 def times_of(stream: Signal | Images, clock: ClockEntry) -> np.ndarray:

@@ -187,3 +187,15 @@ def test_stamps_that_stand_still_are_not_told_to_take_times_of_reception_that_a_
     (tmp_path / "a.csv").write_text("t,q,cmd\n" + "\n".join(f"{t // 1:.0f},{t},{t}" for t in TIME))
     with pytest.raises(RecordingError, match=r"198 of 200 stamps are repeated or missing; mend the log(?!, or)"):
         import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+
+
+def test_rows_that_a_table_of_several_rates_has_for_other_channels_are_no_missing_samples(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "map.toml").write_text('[action]\nhinge = "cmd"\n[measured]\nhinge_position = "q"\n')
+    rows = [f"{t:.3f},,{0.02 * np.sin(t):.5f}" for t in TIME]
+    rows += [f"{t + 0.003:.3f},{0.02 * np.sin(t):.5f}," for t in TIME[::8]]
+    (tmp_path / "a.csv").write_text("t,q,cmd\n" + "\n".join(rows))
+    (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["hinge_position"].time, TIME[::8] + 0.003, atol=1e-6)
+    np.testing.assert_allclose(d.measured["hinge_position"].value[:, 0], 0.02 * np.sin(TIME[::8]), atol=1e-5)
+    np.testing.assert_allclose(d.action["hinge"].time, TIME, atol=1e-6)

@@ -35,7 +35,7 @@ PART = re.compile(rf"(.*?)({'|'.join(UNITS)})", re.IGNORECASE)
 """A name that ends in a unit."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Stamps:
     """Times of the rows so far."""
 
