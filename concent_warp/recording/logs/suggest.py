@@ -15,6 +15,7 @@ from concent_warp.recording.logs.import_log import Source, scene_of
 from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
+from concent_warp.recording.logs.suggest_vectors import VectorChoice, vector_choices
 from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
 from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
 from concent_warp.scene.scene import Scene
@@ -74,10 +75,14 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     poses = sorted({n.removesuffix("/orientation/w") for n in found.signals if n.endswith("/orientation/w")})
     poses = [one for one in poses if f"{one}/position/x" in found.signals]
     lines += _bodies(bodies, poses)
+    under = tuple(f"{pose}/" for pose in poses)
+    used = {one.signal.name for one in (*chosen, *measured)} | {n for n in found.signals if n.startswith(under)}
+    if not poses:
+        several = [one for one in sensors.values() if one.size > 1]
+        vectors = vector_choices(several, [one for one in readings if one.name not in used])
+        used |= {name for one in vectors for name in one.sources}
+        lines += _vectors(several, vectors)
     lines += _images(found)
-    used = {one.signal.name for one in (*chosen, *measured)} | {
-        name for name in found.signals if name.startswith(tuple(f"{pose}/" for pose in poses))
-    }
     if left := [name for name in found.signals if name not in used]:
         lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
     return "\n".join(lines).rstrip() + "\n"
@@ -127,6 +132,21 @@ def _section(kind: str, targets: Sequence[Target], choices: Sequence[_Choice]) -
         if target.name not in matched:
             what = "source = ?" + (", or constant = ?" if kind == "action" else "")
             lines += [f"# [{kind}.{_quoted(target.name)}]  # no channel found", f"# {what}", ""]
+    return lines
+
+
+def _vectors(targets: Sequence[Target], choices: Sequence[VectorChoice]) -> list[str]:
+    """Return the lines of sensors of several numbers."""
+    lines = []
+    for one in choices:
+        lines += [f"[measured.{_quoted(one.target.name)}]" + ("  # guess: the only ones" if one.guess else "")]
+        lines += [f"source = [{', '.join(_text(name) for name in one.sources)}]"]
+        lines += [f"unit = {_text(one.unit)}"] if one.unit else []
+        lines += ['order = "xyzw"'] if one.target.quantity == "orientation" else []
+        lines += [""]
+    for target in targets:
+        if target not in [one.target for one in choices]:
+            lines += [f"# [measured.{_quoted(target.name)}]  # no channel found", "# source = [?]", ""]
     return lines
 
 

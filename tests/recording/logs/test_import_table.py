@@ -199,3 +199,16 @@ def test_rows_that_a_table_of_several_rates_has_for_other_channels_are_no_missin
     np.testing.assert_allclose(d.measured["hinge_position"].time, TIME[::8] + 0.003, atol=1e-6)
     np.testing.assert_allclose(d.measured["hinge_position"].value[:, 0], 0.02 * np.sin(TIME[::8]), atol=1e-5)
     np.testing.assert_allclose(d.action["hinge"].time, TIME, atol=1e-6)
+
+
+def test_a_suggested_map_has_the_components_of_positions_and_orientations(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "a.csv").write_text("t,q1,block:X_mm,block:Y_mm,block:Z_mm,qx,qy,qz,qw\n0,1,2,1,3,0,0,0,1\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    position = '[measured.block_position]\nsource = ["block:X_mm", "block:Y_mm", "block:Z_mm"]\nunit = "mm"\n'
+    turn = '[measured.block_orientation]  # guess: the only ones\nsource = ["qx", "qy", "qz", "qw"]\norder = "xyzw"\n'
+    assert position in text
+    assert turn in text
+    (tmp_path / "a.csv").write_text("t,q1,cmd\n0,1,2\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert "# [measured.block_position]  # no channel found" in text
