@@ -8,6 +8,10 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links
 
+LEVER_SHARE = 0.2
+"""Share of its distance from the hinge that stands for the size of a body that is small beside it, as of a bob [-]:
+its centre of mass may be off by three times as much, that of a rod by its own size."""
+
 
 class BodyEffect(Effect):
     """An effect on one body: a free one, the last link of an arm, or what is fixed to one of these."""
@@ -68,7 +72,7 @@ class CenterOfMass(BodyEffect):
         """Return an offset along each axis of the body."""
         body = self.ids(m)[0]
         extent = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
-        size = max(extent, _lever(m, body) / 3)
+        size = max(extent, LEVER_SHARE * _lever(m, body))
         return tuple(Parameter(axis, "m", 0.0, -3 * size, 3 * size, 0.3 * size) for axis in "xyz")
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
