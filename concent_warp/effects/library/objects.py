@@ -9,7 +9,7 @@ from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links
 
 LEVER_SHARE = 0.2
-"""Share of its distance from the hinge that stands for the size of a body that is small beside it, as of a bob [-]:
+"""Share of its distance from the hinge that is taken for the size of a body that is small beside it, such as a bob [-]:
 its centre of mass may be off by three times as much, that of a rod by its own size."""
 
 
