@@ -212,3 +212,16 @@ def test_a_suggested_map_has_the_components_of_positions_and_orientations(tmp_pa
     (tmp_path / "a.csv").write_text("t,q1,cmd\n0,1,2\n")
     text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
     assert "# [measured.block_position]  # no channel found" in text
+
+
+def test_millimetres_of_a_slide_are_noticed_beside_its_velocity(tmp_path):
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/></body></worldbody>
+        <sensor><jointpos name="p" joint="x"/><jointvel name="v" joint="x"/></sensor></mujoco>"""
+    )
+    (tmp_path / "map.toml").write_text('[measured]\np = "p"\nv = "v"\n')
+    (tmp_path / "a.csv").write_text("t,p,v\n" + "\n".join(f"{t:.2f},{5 * np.sin(t)},{5e-3 * np.cos(t)}" for t in TIME))
+    with pytest.raises(RecordingError, match=r"it moves as much as millimetres beside metres"):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+    (tmp_path / "map.toml").write_text('[measured]\np = { source = "p", unit = "mm" }\nv = "v"\n')
+    assert import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
