@@ -24,6 +24,15 @@ def test_pendulum_hangs_with_its_shifted_centre_of_mass_below_the_hinge():
     np.testing.assert_allclose(move(shifted, 0.5, qpos=[rest]).qpos, rest, atol=1e-9)
 
 
+@pytest.mark.parametrize(("radius", "high"), [(0.001, 0.36), (0.5, 3 * 0.5 * np.sqrt(0.4))])
+def test_a_bob_may_be_off_by_a_share_of_its_cable_or_by_its_size(radius, high):
+    m = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><body name="bob"><joint axis="0 1 0" pos="0 0.3 0"/>
+        <geom type="sphere" size="{radius}" pos="0 0 -0.6"/></body></worldbody></mujoco>"""
+    )
+    assert [p.high for p in CenterOfMass("bob").parameters(m)] == pytest.approx(3 * [high])
+
+
 @pytest.mark.parametrize(("offset", "tips"), [(0.045, False), (0.055, True)])
 def test_block_tips_over_the_edge_that_its_centre_of_mass_lies_beyond(offset, tips):
     block = move(world(BLOCK, CenterOfMass("thing"), offset, 0.0, 0.0), 0.5)

@@ -34,14 +34,14 @@ def rounds(run: TrainingRun, count: int) -> TrainingRun:
     return replace(run, cfg=replace(run.cfg, ppo=replace(PPO, iterations=count)))
 
 
-def updated(process: DistributedProcess) -> dict[str, torch.Tensor]:
-    """Return the weights after an update from given steps of 4 worlds, distributed over the ranks.
+def updated(process: DistributedProcess, epochs: int = 3) -> dict[str, torch.Tensor]:
+    """Return the weights after an update from given steps of 4 worlds, distributed over the ranks; 0 epochs for none.
 
     All steps are one batch and none is sampled, so that the result does not depend on which rank has which worlds.
     """
     count, steps = 4, 6
     environment = replace(SENSED, worlds=count // process.world_size)
-    ppo = PpoCfg(steps=steps, hidden=(16,), epochs=3, batches=1, entropy=0.0)
+    ppo = PpoCfg(steps=steps, hidden=(16,), epochs=max(epochs, 1), batches=1, entropy=0.0)
     task = make_task(environment)
     worlds = make_environment(task, environment, sample_reset_states(task, environment.reset, 0), device="cpu")
     algorithm = Trainer(worlds, TrainCfg(environment=environment, ppo=ppo), None, process).algorithm
@@ -66,7 +66,8 @@ def updated(process: DistributedProcess) -> dict[str, torch.Tensor]:
             algorithm.process_env_step(observation, none, none, {})
     algorithm.storage.returns = sampled["returns"].clone()
     algorithm.storage.advantages = sampled["gain"].clone()
-    algorithm.update()
+    if epochs:
+        algorithm.update()
     networks = {"actor": algorithm.actor, "critic": algorithm.critic}
     return {f"{which}.{k}": v.clone() for which, network in networks.items() for k, v in network.state_dict().items()}
 

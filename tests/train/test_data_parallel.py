@@ -56,8 +56,13 @@ def test_each_process_has_worlds_of_its_own(trained):
 def test_update_is_that_of_one_process_with_the_worlds_of_both(trained):
     alone, shared = updated(DistributedProcess()), loaded(trained / "updated0.pt")
     assert same(shared, loaded(trained / "updated1.pt"))
+    before = updated(DistributedProcess(), epochs=0)
+    assert not same(alone, before)
     for name, value in alone.items():
-        torch.testing.assert_close(shared[name], value, rtol=1e-5, atol=1e-6)
+        # Adam divides by the size of the gradient: of a weight with hardly any, rounding decides the step.
+        change = torch.linalg.vector_norm(value.double() - before[name].double())
+        error = torch.linalg.vector_norm(shared[name].double() - value.double())
+        assert float(error) <= 1e-4 * float(change), name
 
 
 def test_policy_is_not_that_of_a_single_process(trained):

@@ -8,6 +8,10 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links
 
+LEVER_SHARE = 0.2
+"""Share of its distance from the hinge that is taken for the size of a body that is small beside it, such as a bob [-]:
+its centre of mass may be off by three times as much, that of a rod by its own size."""
+
 
 class BodyEffect(Effect):
     """An effect on one body: a free one, the last link of an arm, or what is fixed to one of these."""
@@ -67,7 +71,8 @@ class CenterOfMass(BodyEffect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return an offset along each axis of the body."""
         body = self.ids(m)[0]
-        size = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
+        extent = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
+        size = max(extent, LEVER_SHARE * _lever(m, body))
         return tuple(Parameter(axis, "m", 0.0, -3 * size, 3 * size, 0.3 * size) for axis in "xyz")
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -77,6 +82,21 @@ class CenterOfMass(BodyEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Shift it."""
         m.body_ipos[self.ids(m)] += values
+
+
+def _lever(m: mujoco.MjModel, body: int) -> float:
+    """Return the distance of the centre of mass from the body's hinges [m], 0 without any.
+
+    A small bob on a long cable is as far off as the cable may be longer.
+    """
+    found = [0.0]
+    for j in range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]):
+        arm = m.body_ipos[body] - m.jnt_pos[j]
+        if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE:
+            found.append(float(np.linalg.norm(np.cross(m.jnt_axis[j], arm))))
+        elif m.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL:
+            found.append(float(np.linalg.norm(arm)))
+    return max(found)
 
 
 class Inertia(BodyEffect):

@@ -23,6 +23,8 @@ class PlausibilityCfg:
     """Standard deviation of a joint's position below which it is not compared with its command or speed [rad, m]."""
     unit_ratio: tuple[float, float] = (180 / math.pi / 1.5, 180 / math.pi * 1.5)
     """Ratio of motions that only degrees beside radians explain [-]."""
+    length_ratio: tuple[float, float] = (1000 / 1.5, 1000 * 1.5)
+    """Ratio of motions that only millimetres beside metres explain [-]."""
     min_correlation: Share = 0.8
     """Correlation of measurement and command from which a negative one means a wrong sign [-]."""
     max_clock_difference: PositiveDuration = 0.5

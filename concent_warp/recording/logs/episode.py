@@ -215,7 +215,8 @@ def _lines(channels: list[Numbers], constants: Mapping[str, float]) -> list[Read
     """Return the lines of the table for numbers."""
     found = []
     for one in channels:
-        remark = f"{one.repeated} repeated stamps dropped" if one.repeated else ""
+        dropped = {"repeated stamps": one.repeated, "empty rows": one.empty}
+        remark = ", ".join(f"{count} {what} dropped" for what, count in dropped.items() if count)
         low, high = float(np.nanmin(one.value)), float(np.nanmax(one.value))
         unit = SI[one.target.quantity]
         found.append(

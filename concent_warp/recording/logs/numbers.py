@@ -13,7 +13,7 @@ from concent_warp.recording.logs.cfg import PlausibilityCfg
 from concent_warp.recording.logs.log_map import ClockEntry, LogMap, NumberEntry
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.targets import Target
-from concent_warp.recording.logs.units import SHARES, SI, TIMES, UNITS
+from concent_warp.recording.logs.units import SHARES, SI, TIMES, UNITS, named_unit
 
 LATEST = 4.1e9
 """The year 2100 in seconds since 1970 [s]."""
@@ -39,6 +39,8 @@ class Numbers:
     """Median of reception less time [s]; None where the log has one clock."""
     repeated: int = 0
     """Samples that were dropped since another one has their stamp."""
+    empty: int = 0
+    """Rows that were dropped since they are of other channels."""
 
     @property
     def label(self) -> str:
@@ -104,15 +106,20 @@ def converted(
     signals = _sources(entry, target, episode, where)
     clocks = [mapping.clock_of(signal.name) for signal in signals]
     first = signals[0]
+    if entry.unit is None and entry.scale == 1 and (unit := named_unit(first.name, target.quantity)):
+        si = SI[target.quantity]
+        raise RecordingError(
+            f"its name states {unit}, and the map no unit", where=where, found=first.name,
+            fix=f'write unit = "{unit}" in the map, or unit = "{si}" if its values are in {si}',
+        )  # fmt: skip
     if any(not np.array_equal(signal.time, first.time) for signal in signals[1:]):
         raise RecordingError(
             "the numbers of one channel have different times", where=where, expected="channels of one topic or feature",
             found=[signal.name for signal in signals],
         )  # fmt: skip
     raw = np.stack([signal.value for signal in signals], axis=1)
-    if first.sparse:
-        filled = np.isfinite(raw).any(axis=1)
-        first, raw = replace(first, time=first.time[filled], value=first.value[filled]), raw[filled]
+    filled = np.isfinite(raw).any(axis=1) | (not first.sparse)
+    first, raw = replace(first, time=first.time[filled], value=first.value[filled]), raw[filled]
     time, kept, repeated = clean_times(first, clocks[0], cfg)
     value = _in_si(raw[kept], entry, target, where)
     if target.command:
@@ -123,8 +130,9 @@ def converted(
     source = first.name if len(signals) == 1 else ", ".join(signal.name for signal in signals)
     if len(signals) > 1 and len(entry.source) == 1:
         source = entry.source[0]
+    delay = delay_of(first, clocks[0])
     return Numbers(
-        target, source, where, time, value, entry.unit, entry.noise_std, delay_of(first, clocks[0]), repeated
+        target, source, where, time, value, entry.unit, entry.noise_std, delay, repeated, int((~filled).sum())
     )
 
 
@@ -176,10 +184,10 @@ def clean_times(stream: Signal | Images, clock: ClockEntry, cfg: PlausibilityCfg
     last = np.append(ordered[1:] > ordered[:-1], True) if len(ordered) else np.zeros(0, bool)
     repeated = int(len(time) - last.sum())
     if repeated > cfg.max_repeated * len(time):
-        raise RecordingError(
-            f"{repeated} of {len(time)} stamps are repeated or missing", where=stream.name,
-            fix=f'mend the log, or take the times of reception: [clock] "{stream.name}" = {{ use = "received" }}',
-        )  # fmt: skip
+        fix = "mend the log"
+        if stream.received is not None:
+            fix += f', or take the times of reception: [clock] "{stream.name}" = {{ use = "received" }}'
+        raise RecordingError(f"{repeated} of {len(time)} stamps are repeated or missing", where=stream.name, fix=fix)
     return ordered[last], rows[last], repeated
 
 

@@ -162,16 +162,21 @@ def _against_speed(position: Numbers, speed: Numbers, cfg: PlausibilityCfg) -> R
 def _unit_ratio(
     one: Numbers, other: Numbers, of_one: float, of_other: float, cfg: PlausibilityCfg
 ) -> RecordingError | None:
-    """Return what is wrong where two motions of one joint differ as degrees and radians do."""
-    if "angle" not in (one.target.quantity, other.target.quantity) or min(of_one, of_other) <= 0:
+    """Return what is wrong where two motions of one joint differ as degrees and radians, or mm and m, do."""
+    quantities = {one.target.quantity, other.target.quantity}
+    if min(of_one, of_other) <= 0 or not quantities & {"angle", "length"}:
         return None
+    (low, high), words = (
+        (cfg.unit_ratio, "degrees beside radians")
+        if "angle" in quantities
+        else (cfg.length_ratio, "millimetres beside metres")
+    )
     ratio = of_one / of_other
-    low, high = cfg.unit_ratio
     if max(of_one, of_other) < cfg.min_motion or not (low < ratio < high or low < 1 / ratio < high):
         return None
     large, small = (one, other) if ratio > 1 else (other, one)
     return RecordingError(
-        "it moves as much as degrees beside radians", where=large.where,
+        f"it moves as much as {words}", where=large.where,
         expected=f"the motion of {small.label}, {min(of_one, of_other):.3g} (standard deviation)",
         found=f"{max(of_one, of_other):.3g}, {max(ratio, 1 / ratio):.1f} times as much",
         fix=f"check the units of {large.source} and {small.source}",

@@ -8,17 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.logs.import_log import Source, scene_of
-from concent_warp.recording.logs.pose_columns import pose_columns
 from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
+from concent_warp.recording.logs.suggest_vectors import VectorChoice, vector_choices
 from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
-from concent_warp.recording.logs.units import UNITS
+from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
 from concent_warp.scene.scene import Scene
 
 WORDS = {
@@ -31,8 +30,6 @@ FILLERS = ("observation", "action", "joint", "joints", "states", "command", "com
            "main", "follower", "leader", "actuator", "sensor", "measured", "servo", "target", "setpoint", "desired",
            "actual")  # fmt: skip
 """Words that do not tell one joint from another."""
-NAMED_UNITS = ("rad", "deg", "m", "cm", "mm", "um", "inch", "percent")
-"""Units that the last word of a name may state."""
 ROOM = 20.0
 """Distance of a body from the origin above which positions are guessed to be in millimetres [m]."""
 MAX_DEGREES = 720.0
@@ -81,13 +78,14 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     poses = sorted({n.removesuffix("/orientation/w") for n in found.signals if n.endswith("/orientation/w")})
     poses = [one for one in poses if f"{one}/position/x" in found.signals]
     lines += _bodies(bodies, poses)
-    columns, written = _pose_columns(m, bodies, [one for one in found.signals.values() if one not in commands])
-    lines += [] if poses else columns
+    under = tuple(f"{pose}/" for pose in poses)
+    used = {one.signal.name for one in (*chosen, *measured)} | {n for n in found.signals if n.startswith(under)}
+    if not poses:
+        several = [one for one in sensors.values() if one.size > 1]
+        vectors = vector_choices(several, [one for one in readings if one.name not in used], ROOM)
+        used |= {name for one in vectors for name in one.sources}
+        lines += _vectors(several, vectors)
     lines += _images(found)
-    used = {one.signal.name for one in (*chosen, *measured)} | {
-        name for name in found.signals if name.startswith(tuple(f"{pose}/" for pose in poses))
-    }
-    used |= set() if poses else written
     if left := [name for name in found.signals if name not in used]:
         lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
     return "\n".join(lines).rstrip() + "\n"
@@ -97,7 +95,7 @@ def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
     """Return the channels of a quantity; those whose name says none count as positions."""
     found = []
     for one in signals:
-        words = _words(one.name)
+        words = words_of(one.name)
         said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
         if (said[-1] if said else "position") == quantity and not one.name.endswith(("/x", "/y", "/z", "/w")):
             found.append(one)
@@ -111,7 +109,7 @@ def _matched(targets: Sequence[Target], signals: Sequence[Signal]) -> list[_Choi
     free = list(positions or signals)
     for target in targets:
         keys = {_key(target.name), _key(target.joint)} - {""}
-        hit = next((one for one in free if _key(one.name.rpartition("/")[2]) in keys or _key(one.name) in keys), None)
+        hit = next((one for one in free if _keys(one.name) & keys), None)
         if hit is not None:
             free.remove(hit)
             found[target.name] = _Choice(target, hit)
@@ -140,16 +138,31 @@ def _section(kind: str, targets: Sequence[Target], choices: Sequence[_Choice]) -
     return lines
 
 
+def _vectors(targets: Sequence[Target], choices: Sequence[VectorChoice]) -> list[str]:
+    """Return the lines of sensors of several numbers."""
+    lines = []
+    for one in choices:
+        lines += [f"[measured.{_quoted(one.target.name)}]" + (f"  # guess: {one.guess}" if one.guess else "")]
+        lines += [f"source = [{', '.join(_text(name) for name in one.sources)}]"]
+        lines += [f"unit = {_text(one.unit)}"] if one.unit else []
+        lines += ['order = "xyzw"'] if one.target.quantity == "orientation" else []
+        lines += [""]
+    for target in targets:
+        if target not in [one.target for one in choices]:
+            lines += [f"# [measured.{_quoted(target.name)}]  # no channel found", "# source = [?]", ""]
+    return lines
+
+
 def _unit(choice: _Choice) -> tuple[str, str]:
     """Return the unit that the values suggest, and why; empty where SI fits."""
+    if unit := named_unit(choice.signal.name, choice.target.quantity):
+        return unit, ""
     value = choice.signal.value[np.isfinite(choice.signal.value)]
     target = choice.target
     if not value.size or not target.position:
         return "", ""
     low, high = float(value.min()), float(value.max())
     size, span = max(abs(low), abs(high)), target.range
-    if (named := _named_unit(choice.signal.name)) and UNITS.get(named, (target.quantity,))[0] == target.quantity:
-        return ("" if named in ("rad", "m") else named), ""
     if target.quantity == "angle":
         inside = span is None or (low >= span[0] - 0.35 and high <= span[1] + 0.35)
         if inside and size <= 4 * math.pi:
@@ -186,40 +199,6 @@ def _bodies(bodies: Sequence[str], poses: Sequence[str]) -> list[str]:
     return lines
 
 
-def _pose_columns(m: mujoco.MjModel, bodies: Sequence[str], signals: Sequence[Signal]) -> tuple[list[str], set[str]]:
-    """Return the lines of bodies whose poses are columns of their own, and the channels that these name."""
-    lines: list[str] = []
-    used: set[str] = set()
-    by_name = {one.name: one for one in signals}
-    free = pose_columns(by_name)
-    for body in bodies:
-        hit = next((one for one in free if _key(body) and _key(body) in _key(one.body)), None)
-        guess = ""
-        if hit is None and len(bodies) == len(free) == 1:
-            hit, guess = free[0], "  # guess: the only pose"
-        if hit is None:
-            continue
-        free.remove(hit)
-        far = [float(np.nanmax(np.abs(by_name[name].value), initial=0.0)) for name in hit.position]
-        unit = hit.unit or ("mm" if max(far) > ROOM else "")
-        if unit and not hit.unit:
-            guess = f"  # guess: values up to {max(far):.4g}"
-        place, turn = body_sensors(m, body)
-        assert place is not None
-        assert turn is not None
-        lines += [f"[measured.{_quoted(place)}]{guess}", f"source = {_text(list(hit.position))}"]
-        lines += [f"unit = {_text(unit)}"] if unit not in ("", "m") else []
-        lines += ["", f"[measured.{_quoted(turn)}]", f"source = {_text(list(hit.orientation))}", 'order = "wxyz"', ""]
-        used |= {*hit.position, *hit.orientation}
-    return lines, used
-
-
-def _named_unit(name: str) -> str:
-    """Return the unit that the last word of a name states; empty without one."""
-    words = _words(name)
-    return words[-1] if len(words) > 1 and words[-1] in NAMED_UNITS else ""
-
-
 def _images(episode: Episode) -> list[str]:
     """Return the lines of cameras: each colour stream with the depths of its size whose name is most alike."""
     lines = []
@@ -239,32 +218,30 @@ def _images(episode: Episode) -> list[str]:
 
 def _alike(one: Images, other: Images) -> int:
     """Return how many words two names share."""
-    return len(set(_words(one.name)) & set(_words(other.name)))
+    return len(set(words_of(one.name)) & set(words_of(other.name)))
 
 
 def _camera_name(name: str) -> str:
     """Return a short name of a camera."""
     generic = ("color", "colour", "rgb", "image", "images", "raw", "rect", "compressed", "observation")
-    words = [word for word in _words(name) if word not in generic]
+    words = [word for word in words_of(name) if word not in generic]
     return "_".join(words) or "camera"
 
 
-def _words(name: str) -> list[str]:
-    """Return the words of a name in lower case; camelCase is parted."""
-    parted = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
-    return [word for word in re.split(r"[^a-z0-9]+", parted.lower()) if word]
+def _keys(name: str) -> set[str]:
+    """Return what may tell a channel's joint from another: all of its name, and what is behind topics or dots."""
+    return {_key(one) for one in (name, name.rpartition("/")[2], re.split(r"[/.]", name)[-1])}
 
 
 def _key(name: str) -> str:
     """Return what tells one joint from another in a name."""
     quantities = {word for words in WORDS.values() for word in words}
-    words = _words(name)
-    words = words[:-1] if len(words) > 1 and words[-1] in NAMED_UNITS else words
-    kept = [word for word in words if word not in quantities and word not in FILLERS]
+    quantities |= {*FILLERS, *NAMED, *SI_WORDS}
+    kept = [word for word in words_of(name) if word not in quantities]
     return "_".join(kept)
 
 
-def _text(value: str | list[str]) -> str:
+def _text(value: str) -> str:
     """Return a text as TOML."""
     import json
 

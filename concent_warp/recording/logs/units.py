@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Literal
 
 Quantity = Literal[
@@ -55,3 +56,29 @@ SI: dict[Quantity, str] = {
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 DEPTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "100um": 1e-4, "um": 1e-6}
 """Units of depth; RealSense's D405 counts in 100 um."""
+_SPELLINGS: dict[str, dict[Quantity, str]] = {
+    "mm millimeter millimeters millimetre millimetres": {"length": "mm", "velocity": "mm/s"},
+    "cm centimeter centimeters centimetre centimetres": {"length": "cm"},
+    "um": {"length": "um"},
+    "inch inches": {"length": "inch"},
+    "deg degs degree degrees": {"angle": "deg", "angular velocity": "deg/s"},
+    "dps": {"angular velocity": "deg/s"},
+    "rpm": {"angular velocity": "rpm"},
+    "mnm": {"torque": "mNm"},
+}
+NAMED = {word: units for spellings, units in _SPELLINGS.items() for word in spellings.split()}
+"""Units that are not SI by the words at the end of a channel's name that state them, in lower case."""
+SI_WORDS = ("rad", "rads", "radian", "radians", "nm", "mps", "meters", "metres")
+"""Words at the end of a name that state units of SI."""
+
+
+def words_of(name: str) -> list[str]:
+    """Return the words of a name in lower case; camelCase is parted."""
+    parted = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
+    return [word for word in re.split(r"[^a-z0-9]+", parted.lower()) if word]
+
+
+def named_unit(name: str, quantity: Quantity) -> str | None:
+    """Return the unit, not of SI, that the name of a channel states for a quantity: ``mm`` of ``stage/pos_mm``."""
+    ends = [words[-1] for part in re.split(r"[/.]", name) if (words := words_of(part))]
+    return next((NAMED[end][quantity] for end in reversed(ends) if quantity in NAMED.get(end, {})), None)

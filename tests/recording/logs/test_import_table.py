@@ -8,7 +8,6 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.logs.import_log import import_log
-from concent_warp.recording.logs.pose_columns import pose_columns
 from concent_warp.recording.logs.readers.csv_table import table_signals
 from concent_warp.recording.logs.readers.kinds import log_sources
 from concent_warp.recording.logs.suggest import suggest_map
@@ -60,25 +59,32 @@ def test_a_map_is_suggested_from_the_names_of_columns(folder):
     text = suggest_map(folder / "log.csv", folder / "robot.xml")
     assert 'source = "cmd_hinge"\nunit = "deg"' in text
     assert 'source = "hinge"\nunit = "deg"' in text
-    assert '[measured.block_position]  # guess: the only pose\nsource = ["x", "y", "z"]\n' in text
-    assert '[measured.block_orientation]\nsource = ["qw", "qx", "qy", "qz"]\norder = "wxyz"\n' in text
+    assert '[measured.block_position]  # guess: the only ones\nsource = ["x", "y", "z"]\n' in text
 
 
 @pytest.mark.parametrize(
     ("position", "orientation", "unit"),
     [
-        (["cup_x", "cup_y", "cup_z"], ["cup_qw", "cup_qx", "cup_qy", "cup_qz"], ""),
-        (["cup_px_mm", "cup_py_mm", "cup_pz_mm"], ["cup_rw", "cup_rx", "cup_ry", "cup_rz"], "mm"),
-        (["cup.pos.x", "cup.pos.y", "cup.pos.z"], ["cup.quat.w", "cup.quat.x", "cup.quat.y", "cup.quat.z"], ""),
-        (["x [m]", "y [m]", "z [m]"], ["q_w", "q_x", "q_y", "q_z"], "m"),
+        (["block_x", "block_y", "block_z"], ["block_qx", "block_qy", "block_qz", "block_qw"], ""),
+        (["block_px_mm", "block_py_mm", "block_pz_mm"], ["block_rx", "block_ry", "block_rz", "block_rw"], "mm"),
+        (["block.pos.x", "block.pos.y", "block.pos.z"], ["block.q.x", "block.q.y", "block.q.z", "block.q.w"], ""),
+        (["x [m]", "y [m]", "z [m]"], ["q_x", "q_y", "q_z", "q_w"], ""),
+        (["x", "y", "z"], ["qx", "qy", "qz", "qw"], "mm"),
     ],
 )
-def test_poses_are_found_by_the_names_of_their_columns(position, orientation, unit):
-    (found,) = pose_columns([*reversed(orientation), "flux", "cup_index", *position])
-    assert found.position == tuple(position)
-    assert found.orientation == tuple(orientation)
-    assert found.unit == unit
-    assert pose_columns(position) == pose_columns(orientation) == []
+def test_poses_are_found_by_the_names_of_their_columns(folder, position, orientation, unit):
+    names = [*reversed(orientation), "flux", "block_index", *position]
+    value = 400 if unit else 0.4
+    (folder / "log.csv").write_text(f"t,{','.join(names)}\n0,1,0,0,0,7,3,{value},{value},{value}\n")
+    text = suggest_map(folder / "log.csv", folder / "robot.xml")
+
+    def listed(columns: list[str]) -> str:
+        return ", ".join(f'"{name}"' for name in columns)
+
+    stated = f'unit = "{unit}"\n' if unit else ""
+    assert f"source = [{listed(position)}]\n{stated}\n" in text
+    assert f'source = [{listed(orientation)}]\norder = "xyzw"\n' in text
+    assert ("values up to 400" in text) == (unit == "mm" and position[0] == "x")
 
 
 def test_units_in_names_are_taken_and_negative_lengths_are_judged_by_their_size(tmp_path):
@@ -124,15 +130,54 @@ def test_a_folder_of_tables_without_common_columns_is_one_episode(folder):
     assert log_sources(run) == [run / "again.csv", run / "joints.csv"]
 
 
-@pytest.mark.parametrize(("name", "text"), [("t_ms", "1500"), ("time [us]", "1500000"), ("timestamp_ns", "1500000000")])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t_ms", "1500"),
+        ("time [us]", "1500000"),
+        ("timestamp_ns", "1500000000"),
+        ("Time (Seconds)", "1.5"),
+        ("%time", "1.5"),
+        ("__time", "1.5"),
+        ("field.header.stamp", "1.5"),
+        ("sim_time_ms", "1500"),
+        ("timestamp", "1970-01-01 00:00:01.5"),
+        ("timestamp", "1970-01-01T01:00:01.5+01:00"),
+    ],
+)
 def test_the_name_of_the_times_may_state_their_unit(tmp_path, name, text):
     (tmp_path / "a.csv").write_text(f"a,{name}\n1,{text}\n")
     assert table_signals(tmp_path / "a.csv")["a"].time == pytest.approx([1.5])
 
 
 @pytest.mark.parametrize(
+    "names",
+    [
+        ("time_sec", "time_nsec"),
+        ("header.stamp.secs", "header.stamp.nsecs"),
+        ("/js/header.stamp.sec", "/js/header.stamp.nanosec"),
+        ("sec", "nsec"),
+        ("stamp_s", "stamp_ns"),
+    ],
+)
+def test_stamps_of_whole_seconds_and_nanoseconds_are_put_together(tmp_path, names):
+    (tmp_path / "a.csv").write_text(f"a,{names[1]},{names[0]}\n1,500000000,1700000000\n2,20,1700000001\n")
+    found = table_signals(tmp_path / "a.csv")
+    assert list(found) == ["a"]
+    np.testing.assert_array_equal(found["a"].time, [1700000000.5, 1700000001 + 2e-8])
+
+
+@pytest.mark.parametrize("rows", ["1,1500000000,1\n2,2000000000,2\n", "1.5,1500000000,1\n2.0,2000000000,2\n"])
+def test_nanoseconds_that_count_all_of_the_time_are_not_added_to_the_seconds(tmp_path, rows):
+    (tmp_path / "a.csv").write_text(f"time_s,time_ns,a\n{rows}")
+    np.testing.assert_array_equal(table_signals(tmp_path / "a.csv")["a"].time, [1.5, 2])
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("sim_time,wall_time\n1,2\n", r"several columns of a table may be the time.*rename the one that is meant"),
+        ("t,a\nyesterday,2\n", "line 2: a time is not a number; found 'yesterday'"),
         ("a,b\n1,2\n", "a table has no times; expected names in the first line, one of them time or timestamp"),
         ("t,a,a\n1,2,3\n", r"two columns of a table have the same name.*\['a'\]"),
         ("t,a\n1,2,3\n", "line 2: wrong number of columns; expected 2, found 3"),
@@ -182,3 +227,70 @@ def test_notes_in_a_folder_of_bags_are_no_log(tmp_path):
     (tmp_path / "a.mcap").unlink()
     (tmp_path / "b.mcap").unlink()
     assert [one.name for one in log_sources(tmp_path)] == ["notes.csv"]
+
+
+def test_a_unit_that_the_name_of_a_column_states_is_not_taken_for_si(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    rows = "\n".join(f"{t:.2f},{20 * np.sin(t):.5f},{0.03 * np.sin(t):.5f},1,2,{t:.2f}" for t in TIME)
+    (tmp_path / "a.csv").write_text("t,hinge_deg,cmd_hinge,p_x_mm,p_y_mm,p_z_mm\n" + rows)
+    position = '[measured.block_position]\nsource = ["p_x_mm", "p_y_mm", "p_z_mm"]\n'
+    (tmp_path / "map.toml").write_text(f'[action]\nhinge = "cmd_hinge"\n{position}')
+    with pytest.raises(RecordingError, match=r"block_position.*its name states mm, and the map no unit"):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+    (tmp_path / "map.toml").write_text(f'[action]\nhinge = "cmd_hinge"\n{position}unit = "mm"\n')
+    (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["block_position"].value[-1], [1e-3, 2e-3, TIME[-1] * 1e-3])
+
+
+def test_a_suggested_map_has_the_units_that_names_state(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "a.csv").write_text("t,seq,arm.position.hinge_deg,arm.command.hinge_deg\n0,1,2,1\n1,2,2.5,2\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert '[measured.hinge_position]\nsource = "arm.position.hinge_deg"\nunit = "deg"\n' in text
+    assert '[action.hinge]\nsource = "arm.command.hinge_deg"\nunit = "deg"\n' in text
+
+
+def test_stamps_that_stand_still_are_not_told_to_take_times_of_reception_that_a_table_has_not(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "map.toml").write_text('[action]\nhinge = "cmd"\n[measured]\nhinge_position = "q"\n')
+    (tmp_path / "a.csv").write_text("t,q,cmd\n" + "\n".join(f"{t // 1:.0f},{t},{t}" for t in TIME))
+    with pytest.raises(RecordingError, match=r"198 of 200 stamps are repeated or missing; mend the log(?!, or)"):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+
+
+def test_rows_that_a_table_of_several_rates_has_for_other_channels_are_no_missing_samples(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "map.toml").write_text('[action]\nhinge = "cmd"\n[measured]\nhinge_position = "q"\n')
+    rows = [f"{t:.3f},,{0.02 * np.sin(t):.5f}" for t in TIME]
+    rows += [f"{t + 0.003:.3f},{0.02 * np.sin(t):.5f}," for t in TIME[::8]]
+    (tmp_path / "a.csv").write_text("t,q,cmd\n" + "\n".join(rows))
+    (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["hinge_position"].time, TIME[::8] + 0.003, atol=1e-6)
+    np.testing.assert_allclose(d.measured["hinge_position"].value[:, 0], 0.02 * np.sin(TIME[::8]), atol=1e-5)
+    np.testing.assert_allclose(d.action["hinge"].time, TIME, atol=1e-6)
+
+
+def test_a_suggested_map_has_the_components_of_positions_and_orientations(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "a.csv").write_text("t,q1,block:X_mm,block:Y_mm,block:Z_mm,qx,qy,qz,qw\n0,1,2,1,3,0,0,0,1\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    position = '[measured.block_position]\nsource = ["block:X_mm", "block:Y_mm", "block:Z_mm"]\nunit = "mm"\n'
+    turn = '[measured.block_orientation]  # guess: the only ones\nsource = ["qx", "qy", "qz", "qw"]\norder = "xyzw"\n'
+    assert position in text
+    assert turn in text
+    (tmp_path / "a.csv").write_text("t,q1,cmd\n0,1,2\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert "# [measured.block_position]  # no channel found" in text
+
+
+def test_millimetres_of_a_slide_are_noticed_beside_its_velocity(tmp_path):
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/></body></worldbody>
+        <sensor><jointpos name="p" joint="x"/><jointvel name="v" joint="x"/></sensor></mujoco>"""
+    )
+    (tmp_path / "map.toml").write_text('[measured]\np = "p"\nv = "v"\n')
+    (tmp_path / "a.csv").write_text("t,p,v\n" + "\n".join(f"{t:.2f},{5 * np.sin(t)},{5e-3 * np.cos(t)}" for t in TIME))
+    with pytest.raises(RecordingError, match=r"it moves as much as millimetres beside metres"):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+    (tmp_path / "map.toml").write_text('[measured]\np = { source = "p", unit = "mm" }\nv = "v"\n')
+    assert import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations

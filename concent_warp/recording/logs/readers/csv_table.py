@@ -1,4 +1,4 @@
-"""Tables of numbers, CSV: a header of names, a row a sample, one column of which is the time.
+"""Tables of numbers, CSV: a header of names, a row a sample; which columns are the time is said in `table_times`.
 
 A file by itself is a log of one episode; so is a folder of files that have no column in common, as one of the joints
 and one of motion capture, and beside images a file is a part of their episode.
@@ -18,17 +18,13 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.logs.readers.log import Episode, Signal
+from concent_warp.recording.logs.readers.table_times import Stamps
 
 COMMAND = re.compile(
     r"(?i:command|cmd|goal|target|setpoint|desired)|(?<![A-Za-z])(?i:action)|(?<=[a-z])Action"  # no reaction
 )
 """Parts of names that say that a column, or all of a table, is commanded."""
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-"""Whole numbers above the first are since 1970 in units of the second [s]."""
-TIME = re.compile(r"(?:time|timestamp|time_?stamp|stamp|t|clock)(?:[ _]?[\[(]?(s|sec|ms|us|ns)[\])]?)?", re.IGNORECASE)
-"""Names of a column of times, with its unit."""
-UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SEPARATORS = (",", ";", "\t")
 TABLES = (".csv", ".tsv")
 
@@ -68,10 +64,11 @@ def is_one_episode(folder: Path) -> bool:
     for path in tables:
         try:
             header = [name.strip() for name in next(table_rows(path), (0, [""]))[1]]
+            stamps = Stamps.of(header, str(path))
         except RecordingError:
             return False
-        names = {name for name in header if not TIME.fullmatch(name)}
-        if len(names) == len(header) or not names or names & seen:
+        names = {name for k, name in enumerate(header) if k not in (stamps.column, stamps.rest)}
+        if not names or names & seen:
             return False
         seen |= names
     return len(tables) > 1
@@ -89,37 +86,27 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
     """
     rows = table_rows(path)
     header = [name.strip() for name in next(rows, (0, [""]))[1]]
-    clocks = [(k, hit[1]) for k, name in enumerate(header) if (hit := TIME.fullmatch(name))]
-    if len(header) < 2 or not clocks:
-        raise RecordingError(
-            "a table has no times",
-            where=f"{path}, line 1",
-            expected="names in the first line, one of them time or timestamp, also with a unit as in time_ms",
-            found=",".join(header)[:200],
-        )
+    stamps = Stamps.of(header, f"{path}, line 1")
     if twice := sorted({name for name in header if header.count(name) > 1}):
         raise RecordingError("two columns of a table have the same name", where=f"{path}, line 1", found=twice)
-    (clock, unit), *_ = clocks
-    scale = UNITS.get((unit or "").lower())
-    times, columns = array("d"), [_Column(name) for name in header]
+    columns = [_Column(name) for name in header]
     for line, cells in rows:
         where = f"{path}, line {line}"
         if len(cells) != len(header):
             raise RecordingError("wrong number of columns", where=where, expected=len(header), found=len(cells))
-        text = cells[clock].strip()
         try:
-            times.append(float(text) * scale if scale else seconds(text))
-        except ValueError:
-            raise _not_a_number("a time", where, text) from None
+            stamps.append(cells)
+        except ValueError as error:
+            raise _not_a_number("a time", where, str(error)) from None
         for column, cell in zip(columns, cells, strict=True):
             column.append(line, cell.strip())
-    if not times:
+    if not len(stamps):
         raise RecordingError("a table has no rows below its header", where=path)
-    found, stamps = {}, np.array(times)
+    found, (times, used) = {}, stamps.times()
     for k, column in enumerate(columns):
-        if k != clock and (values := column.numbers(path)) is not None:
+        if k not in used and (values := column.numbers(path)) is not None:
             name = folder + column.name
-            found[name] = Signal(name, stamps, values, command=COMMAND.search(name) is not None, sparse=True)
+            found[name] = Signal(name, times, values, command=COMMAND.search(name) is not None, sparse=True)
     return found
 
 
@@ -162,14 +149,6 @@ def _not_a_number(what: str, where: str, text: str) -> RecordingError:
     """Return the refusal of a cell."""
     fix = "write decimals with a point" if DECIMAL_COMMA.fullmatch(text) else None
     return RecordingError(f"{what} is not a number", where=where, found=repr(text[:40]), fix=fix)
-
-
-def seconds(text: str) -> float:
-    """Return a time that is written as text [s]: whole numbers since 1970 by their size."""
-    value = float(text)
-    if "." not in text:
-        return next((value * unit for least, unit in EPOCHS if value >= least), value)
-    return next((value * unit for least, unit in EPOCHS[1:] if value >= least), value)
 
 
 def table_rows(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -22,10 +22,11 @@ from concent_warp.documents import is_number, read_json
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.logs.readers.calibration import Calibration, distortion_of, numbers
-from concent_warp.recording.logs.readers.csv_table import seconds, table_rows, table_signals
+from concent_warp.recording.logs.readers.csv_table import table_rows, table_signals
 from concent_warp.recording.logs.readers.image_files import SUFFIXES, read_image
 from concent_warp.recording.logs.readers.kinds import COLOUR_FOLDERS, DEPTH_FOLDERS, INTRINSICS
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
+from concent_warp.recording.logs.readers.table_times import seconds
 
 CAMERA = "camera"
 """Name of the calibration, where the folder has one camera."""
