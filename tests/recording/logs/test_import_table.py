@@ -141,6 +141,7 @@ def test_a_folder_of_tables_without_common_columns_is_one_episode(folder):
         ("__time", "1.5"),
         ("field.header.stamp", "1.5"),
         ("sim_time_ms", "1500"),
+        ("ts", "1970-01-01T00:00:01.5"),
         ("timestamp", "1970-01-01 00:00:01.5"),
         ("timestamp", "1970-01-01T01:00:01.5+01:00"),
     ],
@@ -165,6 +166,20 @@ def test_stamps_of_whole_seconds_and_nanoseconds_are_put_together(tmp_path, name
     found = table_signals(tmp_path / "a.csv")
     assert list(found) == ["a"]
     np.testing.assert_array_equal(found["a"].time, [1700000000.5, 1700000001 + 2e-8])
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("%time,field.header.stamp,a", "1764000000500000000,1764000000400000000,3"),
+        ("stats,status,ts,a", "1,0.25,1764000000500,3"),
+        ("time_from_start.secs,time_from_start.nsecs,timestamp,a", "0,7,1764000000.5,3"),
+        ("__time,/js/header.stamp.sec,/js/header.stamp.nanosec,a", "1764000000.5,1764000000,300000000,3"),
+    ],
+)
+def test_the_column_that_is_named_time_is_the_time_beside_others_that_end_so(tmp_path, header, row):
+    (tmp_path / "a.csv").write_text(f"{header}\n{row}\n")
+    np.testing.assert_array_equal(table_signals(tmp_path / "a.csv")["a"].time, [1764000000.5])
 
 
 @pytest.mark.parametrize("rows", ["1,1500000000,1\n2,2000000000,2\n", "1.5,1500000000,1\n2.0,2000000000,2\n"])
