@@ -239,6 +239,10 @@ def test_notes_in_a_folder_of_bags_are_no_log(tmp_path):
     for name in ("a.mcap", "b.mcap", "notes.csv"):
         (tmp_path / name).write_text("")
     assert [one.name for one in log_sources(tmp_path)] == ["a.mcap", "b.mcap"]
+    (tmp_path / "notes.csv").write_text("time,temperature\n0,1\n")
+    (tmp_path / "phases.csv").write_text("time,phase\n0,1\n")
+    assert [one.name for one in log_sources(tmp_path)] == ["a.mcap", "b.mcap"]
+    (tmp_path / "phases.csv").unlink()
     (tmp_path / "a.mcap").unlink()
     (tmp_path / "b.mcap").unlink()
     assert [one.name for one in log_sources(tmp_path)] == ["notes.csv"]
@@ -296,6 +300,17 @@ def test_a_suggested_map_has_the_components_of_positions_and_orientations(tmp_pa
     (tmp_path / "a.csv").write_text("t,q1,cmd\n0,1,2\n")
     text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
     assert "# [measured.block_position]  # no channel found" in text
+
+
+def test_a_finger_that_cannot_follow_since_it_holds_an_object_is_in_metres(tmp_path):
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><worldbody><body><joint name="x" type="slide" range="0 0.1"/><geom size="0.1"/></body></worldbody>
+        <actuator><position name="x" joint="x"/></actuator><sensor><jointpos name="p" joint="x"/></sensor></mujoco>"""
+    )
+    (tmp_path / "map.toml").write_text('[action]\nx = "cmd"\n[measured]\np = "p"\n')
+    rows = [f"{t:.2f},{0.05 + 4e-5 * np.sin(9 * t):.7f},{0.04 + 0.04 * np.sin(9 * t):.5f}" for t in TIME]
+    (tmp_path / "a.csv").write_text("t,p,cmd\n" + "\n".join(rows))
+    assert import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
 
 
 def test_millimetres_of_a_slide_are_noticed_beside_its_velocity(tmp_path):
