@@ -11,6 +11,7 @@ from concent_warp.recording.logs.import_log import import_log
 from concent_warp.recording.logs.readers.csv_table import table_signals
 from concent_warp.recording.logs.readers.kinds import log_sources
 from concent_warp.recording.logs.suggest import suggest_map
+from concent_warp.recording.logs.units import named_unit
 
 SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-2 2"/><geom size="0.1" mass="1"/></body>
 <body name="block" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody>
@@ -259,6 +260,13 @@ def test_a_unit_that_the_name_of_a_column_states_is_not_taken_for_si(tmp_path):
     (tmp_path / "map.toml").write_text(f'[action]\nhinge = "cmd_hinge"\n{position}unit = "mm"\n')
     (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
     np.testing.assert_allclose(d.measured["block_position"].value[-1], [1e-3, 2e-3, TIME[-1] * 1e-3])
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("elbow_deg", "deg"), ("run_deg/elbow", "deg"), ("run_deg/elbow_rad", None), ("elbow_mm", None)]
+)
+def test_the_unit_of_a_name_is_that_of_its_last_word_that_states_one(name, unit):
+    assert named_unit(name, "angle") == unit
 
 
 def test_a_suggested_map_has_the_units_that_names_state(tmp_path):
