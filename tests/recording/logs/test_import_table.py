@@ -321,6 +321,17 @@ def test_a_finger_that_cannot_follow_since_it_holds_an_object_is_in_metres(tmp_p
     assert import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
 
 
+def test_velocities_forces_and_markers_of_a_body_are_not_suggested_for_its_position(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    names = ["block_velocity", "block_marker", "block", "force", "block_accel"]
+    columns = [f"{name}_{axis}" for name in names for axis in "xyz"]
+    (tmp_path / "a.csv").write_text(f"t,q1,{','.join(columns)}\n0,1{15 * ',0'}\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert '[measured.block_position]\nsource = ["block_x", "block_y", "block_z"]\n' in text
+    (tmp_path / "a.csv").write_text("t,q1,force_x,force_y,force_z\n0,1,0,0,0\n")
+    assert "# [measured.block_position]  # no channel found" in suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+
+
 def test_millimetres_of_a_slide_are_noticed_beside_its_velocity(tmp_path):
     (tmp_path / "robot.xml").write_text(
         """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/></body></worldbody>
