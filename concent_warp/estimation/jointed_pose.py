@@ -17,7 +17,7 @@ def jointed_pose(
 ) -> tuple[np.ndarray, np.ndarray, Rotation] | None:
     """Return times [s], positions [m] (T, 3) and rotations of a body's frame, from the sensors of its joints.
 
-    Times are those of the joint with most samples; the others are interpolated.
+    Times are those of the joint with most samples, as far as all were measured; the others are interpolated.
 
     Args:
         m: The compiled scene.
@@ -26,7 +26,7 @@ def jointed_pose(
 
     Returns:
         None where a joint between the world and the body was not measured, is driven by an actuator, or is no hinge or
-        slide, and for a body without joints.
+        slide, where they were measured at different times, and for a body without joints.
     """
     joints, row = [], m.body(body).id
     while row:
@@ -44,7 +44,11 @@ def jointed_pose(
             readings[int(m.sensor_objid[sensor])] = channel.time[known], channel.value[known, 0]
     if not set(joints) <= readings.keys():
         return None
-    time = max((readings[j][0] for j in joints), key=len)
+    times = [readings[j][0] for j in joints]
+    time = max(times, key=len)
+    time = time[(time >= max(one[0] for one in times)) & (time <= min(one[-1] for one in times))]
+    if not len(time):
+        return None
     data = mujoco.MjData(m)
     position, quaternion = np.zeros((len(time), 3)), np.zeros((len(time), 4))
     values = {int(m.jnt_qposadr[j]): np.interp(time, *readings[j]) for j in joints}

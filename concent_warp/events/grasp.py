@@ -51,7 +51,7 @@ def robot_onsets(
 
 
 def _displacement(rows: ReplayContacts, motion: BodyPoses, body: int) -> float:
-    """Return how far a contact with an object displaces a touched point of it, between any two of its steps [m].
+    """Return how far a contact with an object displaces a touched point of it from where it is at first [m].
 
     Args:
         rows: The contact, with the object as its second body.

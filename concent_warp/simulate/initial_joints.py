@@ -36,7 +36,8 @@ class InitialJointsCfg:
     difference: Positive = 1e-6
     """Displacement by which derivatives are found [m or rad]."""
     min_singular: Positive = 1e-3
-    """Smallest singular value of the derivatives, as a share of the largest, that determines joints [-]."""
+    """Smallest singular value of the derivatives, as a share of the largest, that determines joints [-]; the weight of
+    equality constraints is left aside, so that they hide no short lever."""
     equality_weight: Positive = 100.0
     """Weight of equality constraints, which hold, over measurements, which have noise [-]."""
 
@@ -80,18 +81,21 @@ def with_unmeasured_joints(
     low = np.where(limited, m.jnt_range[joints, 0], -np.inf)
     high = np.where(limited, m.jnt_range[joints, 1], np.inf)
     found, now = np.array(qpos, dtype=float), residuals(qpos)
+    least = cfg.min_singular / (cfg.equality_weight if m.neq else 1)
     for _ in range(cfg.max_steps):
         slope = np.zeros((len(now), len(joints)))
         for k, address in enumerate(at):
             moved = found.copy()
             moved[address] += cfg.difference
             slope[:, k] = (residuals(moved) - now) / cfg.difference
-        step = np.linalg.lstsq(slope, -now, rcond=cfg.min_singular)[0] if len(now) else np.zeros(len(joints))
-        step *= np.abs(slope).max(axis=0, initial=0.0) > cfg.min_singular
+        step = np.linalg.lstsq(slope, -now, rcond=least)[0] if len(now) else np.zeros(len(joints))
+        told = np.abs(slope).max(axis=0, initial=0.0) > cfg.min_singular
+        step *= told
         if np.abs(step).max() < cfg.tolerance:
             break
         tried = found.copy()
-        tried[at] = np.clip(found[at] + np.clip(step, -cfg.max_step, cfg.max_step), low, high)
+        stepped = np.clip(found[at] + np.clip(step, -cfg.max_step, cfg.max_step), low, high)
+        tried[at] = np.where(told, stepped, found[at])  # a reference pose may be outside a joint's range
         after = residuals(tried)
         if not after @ after < now @ now:
             break

@@ -1,5 +1,7 @@
 """Objects on joints of their own, which were measured instead of their pose."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -43,6 +45,17 @@ def test_pose_of_a_planar_object_follows_from_its_joints() -> None:
     np.testing.assert_array_equal(time, TIME)
     np.testing.assert_allclose(position, np.stack([0.1 * TIME, 0.2 * TIME, np.full(11, 0.01)], axis=1), atol=1e-12)
     np.testing.assert_allclose(turn.as_rotvec()[:, 2], TIME, atol=1e-12)
+
+
+def test_a_pose_is_known_as_long_as_all_of_its_joints_were_measured() -> None:
+    model, whole = mujoco.MjModel.from_xml_string(PLANAR), demonstration("x", "y", "turn")
+    late = Channel(TIME[4:9], whole.measured["y"].value[4:9])
+    found = jointed_pose(model, replace(whole, measured={**whole.measured, "y": late}), "tee")
+    assert found is not None
+    np.testing.assert_array_equal(found[0], TIME[4:9])
+    np.testing.assert_allclose(found[1][:, 1], 0.2 * TIME[4:9], atol=1e-12)
+    never = Channel(TIME[-1:] + 1, np.zeros((1, 1)))
+    assert jointed_pose(model, replace(whole, measured={**whole.measured, "y": never}), "tee") is None
 
 
 def test_a_fit_aims_at_an_object_on_measured_joints() -> None:

@@ -69,3 +69,14 @@ def test_measured_poses_of_a_drawer_and_a_lever_tell_their_joints() -> None:
 
 def test_a_joint_that_was_measured_stays_as_measured() -> None:
     np.testing.assert_array_equal(started(GRIPPER, left=[0.02], right=[0.03])[:2], [0.02, 0.03])
+
+
+def test_a_short_lever_is_told_by_its_place_beside_a_coupling_and_untold_joints_stay_out_of_their_range() -> None:
+    bodies = """
+    <body><joint name="wrist" axis="0 1 0" range="-90 -4"/><geom size="0.01" mass="0.1"/></body>
+    <body><joint axis="0 1 0"/><geom size="0.01" mass="0.1"/><site name="tip" pos="0.05 0 0"/></body></worldbody>"""
+    xml = GRIPPER.replace("</worldbody>", bodies).replace(
+        "<sensor>", '<sensor><framepos name="tip" objtype="site" objname="tip"/>'
+    )
+    tip = [0.05 * np.cos(0.4), 0.0, -0.05 * np.sin(0.4)]
+    np.testing.assert_allclose(started(xml, left=[0.02], tip=tip), [0.02, 0.021, 0.0, 0.0, 0.4], atol=1e-6)

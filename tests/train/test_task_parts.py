@@ -151,6 +151,9 @@ def test_turning_fingers_whose_range_is_in_degrees_are_refused():
     limited.jnt_limited[1], limited.jnt_range[1] = 1, (-0.7, 0.7)
     with pytest.raises(TrainError, match=r"'turn' is far beyond its joint.*-0.7 to 0.7, found -40 to 40; write rad"):
         Robot.of(limited, cfg)
+    limited.actuator_gear[0, 0] = -57.3  # commands in degrees
+    assert Robot.of(limited, cfg).step[-1] == pytest.approx(80 * cfg.gripper_share)
+    limited.actuator_gear[0, 0] = 1
     limited.actuator_ctrlrange[0] = -1.5, 1.5  # closes with force
     assert Robot.of(limited, cfg).step[-1] == pytest.approx(3 * cfg.gripper_share)
 

@@ -173,8 +173,9 @@ def _check_angles(m: mujoco.MjModel, i: int) -> None:
     joint = int(m.actuator_trnid[i, 0])
     if not _takes_position(m, i) or int(m.actuator_trntype[i]) not in JOINTS or not m.jnt_limited[joint]:
         return
-    (low, high), commands = m.jnt_range[joint], m.actuator_ctrlrange[i]
-    if commands[0] < low - 2 * np.pi or commands[1] > high + 2 * np.pi:
+    gear, commands = float(m.actuator_gear[i, 0]), m.actuator_ctrlrange[i]
+    low, high = sorted(gear * m.jnt_range[joint])
+    if commands[0] < low - 2 * np.pi * abs(gear) or commands[1] > high + 2 * np.pi * abs(gear):
         raise TrainError(
             f"the ctrlrange of the gripper's actuator {m.actuator(i).name!r} is far beyond its joint, as if in degrees",
             expected=f"rad, about {low:.4g} to {high:.4g}",

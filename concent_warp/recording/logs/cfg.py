@@ -25,6 +25,9 @@ class PlausibilityCfg:
     """Ratio of motions that only degrees beside radians explain [-]."""
     length_ratio: tuple[float, float] = (1000 / 1.5, 1000 * 1.5)
     """Ratio of motions that only millimetres beside metres explain [-]."""
+    min_slide: Positive = 0.001
+    """Standard deviation of the smaller of these motions below which they are not compared [m, m/s]: a finger that
+    holds an object hardly moves, whatever its command."""
     min_correlation: Share = 0.8
     """Correlation of measurement and command from which a negative one means a wrong sign [-]."""
     max_clock_difference: PositiveDuration = 0.5

@@ -166,12 +166,14 @@ def _unit_ratio(
     quantities = {one.target.quantity, other.target.quantity}
     if min(of_one, of_other) <= 0 or not quantities & {"angle", "length"}:
         return None
-    (low, high), words = (
-        (cfg.unit_ratio, "degrees beside radians")
+    (low, high), words, least = (
+        (cfg.unit_ratio, "degrees beside radians", 0.0)
         if "angle" in quantities
-        else (cfg.length_ratio, "millimetres beside metres")
+        else (cfg.length_ratio, "millimetres beside metres", cfg.min_slide)
     )
     ratio = of_one / of_other
+    if min(of_one, of_other) < least:
+        return None
     if max(of_one, of_other) < cfg.min_motion or not (low < ratio < high or low < 1 / ratio < high):
         return None
     large, small = (one, other) if ratio > 1 else (other, one)

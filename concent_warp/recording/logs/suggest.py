@@ -24,6 +24,7 @@ WORDS = {
     "position": ("pos", "position", "positions", "qpos", "angle", "state"),
     "velocity": ("vel", "velocity", "velocities", "qvel", "speed"),
     "effort": ("effort", "torque", "current", "load", "force"),
+    "acceleration": ("acc", "accel", "acceleration", "accelerations"),
 }
 """Words that name a quantity and not a joint."""
 FILLERS = ("observation", "action", "joint", "joints", "states", "command", "commands", "cmd", "goal", "data", "motor",
@@ -82,7 +83,8 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     used = {one.signal.name for one in (*chosen, *measured)} | {n for n in found.signals if n.startswith(under)}
     if not poses:
         several = [one for one in sensors.values() if one.size > 1]
-        vectors = vector_choices(several, [one for one in readings if one.name not in used], ROOM)
+        free = [one for one in readings if one.name not in used and _quantity(one.name) == "position"]
+        vectors = vector_choices(several, free, ROOM)
         used |= {name for one in vectors for name in one.sources}
         lines += _vectors(several, vectors)
     lines += _images(found)
@@ -95,11 +97,16 @@ def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
     """Return the channels of a quantity; those whose name says none count as positions."""
     found = []
     for one in signals:
-        words = words_of(one.name)
-        said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
-        if (said[-1] if said else "position") == quantity and not one.name.endswith(("/x", "/y", "/z", "/w")):
+        if _quantity(one.name) == quantity and not one.name.endswith(("/x", "/y", "/z", "/w")):
             found.append(one)
     return found
+
+
+def _quantity(name: str) -> str:
+    """Return the quantity that a name says, position if it says none."""
+    words = words_of(name)
+    said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
+    return said[-1] if said else "position"
 
 
 def _matched(targets: Sequence[Target], signals: Sequence[Signal]) -> list[_Choice]:

@@ -45,6 +45,7 @@ def vector_choices(targets: Iterable[Target], signals: Sequence[Signal], room: f
         axes = AXES[target.size]
         groups = _groups(signals, axes)
         named = [stem for stem in groups if {*words_of(target.joint)} <= {*stem} and target.joint]
+        named.sort(key=len)  # what its name says beside the body may make it another thing
         alone = len(groups) == 1 == sum(other.size == target.size for other in wanted)
         if stems := named[:1] or (list(groups) if alone else []):
             sources = tuple(groups[stems[0]][axis] for axis in axes)

@@ -79,6 +79,10 @@ def words_of(name: str) -> list[str]:
 
 
 def named_unit(name: str, quantity: Quantity) -> str | None:
-    """Return the unit, not of SI, that the name of a channel states for a quantity: ``mm`` of ``stage/pos_mm``."""
+    """Return the unit, not of SI, that the name of a channel states for a quantity: ``mm`` of ``stage/pos_mm``.
+
+    The last word of the name that states one counts, or those of what is before it, such as a file.
+    """
     ends = [words[-1] for part in re.split(r"[/.]", name) if (words := words_of(part))]
-    return next((NAMED[end][quantity] for end in reversed(ends) if quantity in NAMED.get(end, {})), None)
+    said = next((end for end in reversed(ends) if end in SI_WORDS or quantity in NAMED.get(end, {})), "")
+    return NAMED.get(said, {}).get(quantity)

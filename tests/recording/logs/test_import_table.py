@@ -11,6 +11,7 @@ from concent_warp.recording.logs.import_log import import_log
 from concent_warp.recording.logs.readers.csv_table import table_signals
 from concent_warp.recording.logs.readers.kinds import log_sources
 from concent_warp.recording.logs.suggest import suggest_map
+from concent_warp.recording.logs.units import named_unit
 
 SCENE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-2 2"/><geom size="0.1" mass="1"/></body>
 <body name="block" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody>
@@ -141,6 +142,7 @@ def test_a_folder_of_tables_without_common_columns_is_one_episode(folder):
         ("__time", "1.5"),
         ("field.header.stamp", "1.5"),
         ("sim_time_ms", "1500"),
+        ("ts", "1970-01-01T00:00:01.5"),
         ("timestamp", "1970-01-01 00:00:01.5"),
         ("timestamp", "1970-01-01T01:00:01.5+01:00"),
     ],
@@ -165,6 +167,20 @@ def test_stamps_of_whole_seconds_and_nanoseconds_are_put_together(tmp_path, name
     found = table_signals(tmp_path / "a.csv")
     assert list(found) == ["a"]
     np.testing.assert_array_equal(found["a"].time, [1700000000.5, 1700000001 + 2e-8])
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("%time,field.header.stamp,a", "1764000000500000000,1764000000400000000,3"),
+        ("stats,status,ts,a", "1,0.25,1764000000500,3"),
+        ("time_from_start.secs,time_from_start.nsecs,timestamp,a", "0,7,1764000000.5,3"),
+        ("__time,/js/header.stamp.sec,/js/header.stamp.nanosec,a", "1764000000.5,1764000000,300000000,3"),
+    ],
+)
+def test_the_column_that_is_named_time_is_the_time_beside_others_that_end_so(tmp_path, header, row):
+    (tmp_path / "a.csv").write_text(f"{header}\n{row}\n")
+    np.testing.assert_array_equal(table_signals(tmp_path / "a.csv")["a"].time, [1764000000.5])
 
 
 @pytest.mark.parametrize("rows", ["1,1500000000,1\n2,2000000000,2\n", "1.5,1500000000,1\n2.0,2000000000,2\n"])
@@ -224,6 +240,10 @@ def test_notes_in_a_folder_of_bags_are_no_log(tmp_path):
     for name in ("a.mcap", "b.mcap", "notes.csv"):
         (tmp_path / name).write_text("")
     assert [one.name for one in log_sources(tmp_path)] == ["a.mcap", "b.mcap"]
+    (tmp_path / "notes.csv").write_text("time,temperature\n0,1\n")
+    (tmp_path / "phases.csv").write_text("time,phase\n0,1\n")
+    assert [one.name for one in log_sources(tmp_path)] == ["a.mcap", "b.mcap"]
+    (tmp_path / "phases.csv").unlink()
     (tmp_path / "a.mcap").unlink()
     (tmp_path / "b.mcap").unlink()
     assert [one.name for one in log_sources(tmp_path)] == ["notes.csv"]
@@ -240,6 +260,13 @@ def test_a_unit_that_the_name_of_a_column_states_is_not_taken_for_si(tmp_path):
     (tmp_path / "map.toml").write_text(f'[action]\nhinge = "cmd_hinge"\n{position}unit = "mm"\n')
     (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
     np.testing.assert_allclose(d.measured["block_position"].value[-1], [1e-3, 2e-3, TIME[-1] * 1e-3])
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("elbow_deg", "deg"), ("run_deg/elbow", "deg"), ("run_deg/elbow_rad", None), ("elbow_mm", None)]
+)
+def test_the_unit_of_a_name_is_that_of_its_last_word_that_states_one(name, unit):
+    assert named_unit(name, "angle") == unit
 
 
 def test_a_suggested_map_has_the_units_that_names_state(tmp_path):
@@ -281,6 +308,28 @@ def test_a_suggested_map_has_the_components_of_positions_and_orientations(tmp_pa
     (tmp_path / "a.csv").write_text("t,q1,cmd\n0,1,2\n")
     text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
     assert "# [measured.block_position]  # no channel found" in text
+
+
+def test_a_finger_that_cannot_follow_since_it_holds_an_object_is_in_metres(tmp_path):
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><worldbody><body><joint name="x" type="slide" range="0 0.1"/><geom size="0.1"/></body></worldbody>
+        <actuator><position name="x" joint="x"/></actuator><sensor><jointpos name="p" joint="x"/></sensor></mujoco>"""
+    )
+    (tmp_path / "map.toml").write_text('[action]\nx = "cmd"\n[measured]\np = "p"\n')
+    rows = [f"{t:.2f},{0.05 + 4e-5 * np.sin(9 * t):.7f},{0.04 + 0.04 * np.sin(9 * t):.5f}" for t in TIME]
+    (tmp_path / "a.csv").write_text("t,p,cmd\n" + "\n".join(rows))
+    assert import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+
+
+def test_velocities_forces_and_markers_of_a_body_are_not_suggested_for_its_position(tmp_path):
+    (tmp_path / "robot.xml").write_text(SCENE)
+    names = ["block_velocity", "block_marker", "block", "force", "block_accel"]
+    columns = [f"{name}_{axis}" for name in names for axis in "xyz"]
+    (tmp_path / "a.csv").write_text(f"t,q1,{','.join(columns)}\n0,1{15 * ',0'}\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert '[measured.block_position]\nsource = ["block_x", "block_y", "block_z"]\n' in text
+    (tmp_path / "a.csv").write_text("t,q1,force_x,force_y,force_z\n0,1,0,0,0\n")
+    assert "# [measured.block_position]  # no channel found" in suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
 
 
 def test_millimetres_of_a_slide_are_noticed_beside_its_velocity(tmp_path):

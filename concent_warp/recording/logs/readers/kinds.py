@@ -34,10 +34,15 @@ def log_kind(path: Path) -> LogKind | None:
         folders = {one.name.lower() for one in path.iterdir() if one.is_dir()}
         if folders & {*COLOUR_FOLDERS, *DEPTH_FOLDERS} or any((path / name).exists() for name in INTRINSICS):
             return "images"
-        return "table" if is_one_episode(path) else None
+        return "table" if is_one_episode(path) and not _holds_other_logs(path) else None
     if path.suffix.lower() in TABLES and path.exists():
         return "table"
     return "ros" if path.suffix.lower() in BAGS and path.exists() else None
+
+
+def _holds_other_logs(folder: Path) -> bool:
+    """Return whether a folder has logs beside its tables, which are then notes on these."""
+    return any(log_kind(one) not in ((None,) if one.is_dir() else (None, "table")) for one in folder.iterdir())
 
 
 def log_sources(source: Path | str | Sequence[Path | str]) -> list[Path]:

@@ -1,7 +1,8 @@
 """Times of the rows of a table: which columns they are in, and in which unit.
 
-One column, `time`, `timestamp`, `t` and alike, also with a unit (`time_ms`, `Time (Seconds)`); else one whose name ends
-so (`__time`, `header.stamp`); or two, whole seconds and what is left of them (`header.stamp.secs` and `.nsecs`).
+One column, `time`, `timestamp`, `t` and alike, also with a unit (`time_ms`, `Time (Seconds)`) or signs before it
+(`%time`, `__time`); it may have a second of what is left of whole seconds (`time_sec` and `time_nsec`). Else columns
+whose names end so (`header.stamp`, or `header.stamp.secs` and `.nsecs`).
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ UNITS = {
 """Units of times [s] by the words that name them."""
 _NAME = r"(?:time|timestamp|time_?stamp|stamp|t|clock)"
 _UNIT = rf"(?:[ _.]?[\[(]?({'|'.join(UNITS)})[\])]?)?"
-TIME = re.compile(_NAME + _UNIT, re.IGNORECASE)
+TIME = re.compile(rf"[^a-z0-9]*{_NAME}{_UNIT}", re.IGNORECASE)
 """Names of a column of times, with its unit."""
 ENDS_IN_TIME = re.compile(rf"(?:.*[^a-z])(?:time|timestamp|time_?stamp|stamp){_UNIT}", re.IGNORECASE)
 """Names that end in one of these, behind a prefix such as a topic."""
-PART = re.compile(rf"(.*?)({'|'.join(UNITS)})", re.IGNORECASE)
-"""A name that ends in a unit."""
+PART = re.compile(rf"(|.*[^a-z]|.*time|.*stamp)({'|'.join(UNITS)})", re.IGNORECASE)
+"""A name that ends in a unit as a word of its own: no `status`."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +77,9 @@ class Stamps:
                 expected="names in the first line, one of them time or timestamp, also with a unit as in time_ms, or "
                 "two as time_sec and time_nsec",
             )  # fmt: skip
-        first = min([*(k for k, _ in named), *parts])
-        if first in parts:
-            return parts[first]
-        return Stamps(*next(one for one in named if one[0] == first))
+        # A duration in two columns, such as time_from_start, may stand before the time.
+        first = named[0][0] if named else min(parts)
+        return parts[first] if first in parts else Stamps(*named[0])
 
     def append(self, cells: Sequence[str]) -> None:
         """Add the time of a row.
@@ -89,7 +89,8 @@ class Stamps:
         """
         text = cells[self.column].strip()
         try:
-            self._time.append(float(text) * UNITS[self.unit.lower()] if self.unit else seconds(text))
+            unit = UNITS.get(self.unit.lower(), 1.0)
+            self._time.append(seconds(text) if unit == 1 else float(text) * unit)  # ts may be in any unit
             if self.rest is not None:
                 text = cells[self.rest].strip()
                 self._rest.append(float(text) * UNITS[self.rest_unit.lower()])
