@@ -104,7 +104,8 @@ class RewardCfg:
     """Amplitude and length scale [m] of a third reaching term in chains of stages, for the approach to an object."""
     completion: float = 250.0
     """In chains, reward of each completed stage, once in an episode, of the last one when object 1 has come to rest in
-    place: more than the reaching terms bring within the horizon of the discount, so that the next stage pays off."""
+    place: more than the reaching terms bring within the horizon of the discount, so that the next stage pays off. The
+    value function goes on beyond that end as beyond the end of time, so that the last stage counts for more."""
     stage: float = 0.0
     """In chains, reward per step for each completed stage. An object dropped in a later stage then costs as much as all
     stages before were worth, so that policies learn not to try."""

@@ -128,7 +128,8 @@ class ResetSampler:
             "too few initial states keep the contact chain",
             expected=count,
             found=f"{len(found)}, and discarded {self.discarded}",
-            fix="lower the displacements --environment.reset.position and --environment.reset.turn",
+            fix="lower the displacements --environment.reset.position and .turn, in chains of stages also .place and "
+            ".heading",
         )
 
     def stacked(self, found: list[tuple[np.ndarray, ResetCandidate]]) -> ResetStates:
