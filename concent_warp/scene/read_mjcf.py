@@ -13,6 +13,7 @@ import numpy as np
 
 from concent_warp.errors import SceneError, printable
 from concent_warp.scene.mjcf_scan import scan_file, scan_text
+from concent_warp.scene.quiet_mujoco import quiet_mujoco
 from concent_warp.scene.trial_compile import try_compile
 
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 1.0
@@ -52,7 +53,7 @@ def spec_from_file(path: Path, *, warn_outside: bool = True) -> mujoco.MjSpec:
         warnings.warn(printable(f"{path}: the scene reads files outside its folder: {named}{more}"), stacklevel=2)
     if found.unusual:
         try_compile(str(path), path=path)
-    with readable(path), no_log_file():
+    with readable(path), quiet_mujoco():
         return mujoco.MjSpec.from_file(str(path))
 
 
@@ -63,7 +64,7 @@ def spec_from_text(text: str, source: str) -> mujoco.MjSpec:
         SceneError: MuJoCo cannot read it, or it asks for more than `Limits` allow.
     """
     _check_text(text, source)
-    with readable(source), no_log_file():
+    with readable(source), quiet_mujoco():
         return mujoco.MjSpec.from_string(text)
 
 
@@ -73,7 +74,7 @@ def compile_spec(spec: mujoco.MjSpec, source: object) -> mujoco.MjModel:
     Raises:
         SceneError: MuJoCo cannot compile it, or its time step or another number makes no sense.
     """
-    with readable(source, "compile"), no_log_file():
+    with readable(source, "compile"), quiet_mujoco():
         model = spec.compile()
     check_compiled(model, source)
     return model
@@ -127,17 +128,6 @@ def readable(source: object, what: str = "read") -> Iterator[None]:
     except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
         said = " ".join(str(error).split()) or type(error).__name__
         raise SceneError(f"MuJoCo cannot {what} this MJCF", where=source, found=said) from None
-
-
-@contextmanager
-def no_log_file() -> Iterator[None]:
-    """Keep MuJoCo from writing its warnings to MUJOCO_LOG.TXT in the working folder."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _remark(text: str) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import queue
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from concent_warp.checks import check_at_least
 from concent_warp.errors import EngineError
+from concent_warp.scene.quiet_mujoco import quiet_mujoco
 from concent_warp.simulate.activation import initial_activation
 from concent_warp.simulate.compiled_steps import can_step, cannot_fill_arena
 from concent_warp.simulate.contact_log import collect
@@ -138,7 +138,7 @@ class MujocoEngine:
         results: list[VariantResult | None] = [None] * variants.count
         pending = list(range(variants.count))
         self.repeats = 0
-        with quiet_warnings():
+        with quiet_mujoco():
             while pending:
                 for n, result in zip(pending, self._simulated(run, pending), strict=True):
                     results[n] = result
@@ -196,7 +196,7 @@ class MujocoEngine:
 
     def _all_in_turn(self, run: SimulationRun) -> list[VariantResult | None]:
         """Simulate all variants one after the other, in another process."""
-        with quiet_warnings():
+        with quiet_mujoco():
             return self._in_turn(run, range(run.variants.count))
 
     def _in_turn(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
@@ -370,14 +370,3 @@ class VariantCompiler:
         compiled = self._model.finish(self._spec.compile())
         self._last = tuple(value.copy() for value in values), compiled
         return compiled
-
-
-@contextmanager
-def quiet_warnings() -> Iterator[None]:
-    """Keep MuJoCo from printing warnings and writing a log file: the engine reads the counters instead."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)

@@ -15,11 +15,11 @@ import warp as wp
 
 from concent_warp.checks import check_at_least, check_device
 from concent_warp.errors import EngineError
+from concent_warp.scene.quiet_mujoco import quiet_mujoco
 from concent_warp.simulate.activation import initial_activations
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
 from concent_warp.simulate.inputs import SPHERE_FIELDS, SimulationRun, check_run, compile_model, with_force_models
-from concent_warp.simulate.mujoco_engine import quiet_warnings
 from concent_warp.simulate.warp_model import batchable, check_drag, is_switch
 from concent_warp.simulate.warp_program import Buffers, Demand, Plan, Program, world_bytes
 
@@ -327,7 +327,7 @@ def _probe(compiled: mujoco.MjModel, run: SimulationRun) -> tuple[int, int, int]
             getattr(d, name)[:] = value[0].detach().cpu().numpy() if hasattr(value, "detach") else value[0]
     ctrl = run.ctrl[0]
     contacts = constraints = total = 0
-    with quiet_warnings():
+    with quiet_mujoco():
         for k in range(max(run.steps, 1)):
             if compiled.nu and run.steps:
                 d.ctrl[:] = ctrl[k]

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.scene.quiet_mujoco import quiet_mujoco
 from concent_warp.simulate.activation import FOLLOWING
 from concent_warp.simulate.fields import apply_fields
-from concent_warp.simulate.mujoco_engine import quiet_warnings
 from concent_warp.train.environment.command_dynamics import CommandDynamics, CommandFilter
 from concent_warp.train.environment.graphs import Graph, captured
 from concent_warp.train.environment.kinematics import Kinematics, MujocoKinematics, WarpKinematics
@@ -204,7 +204,7 @@ class MujocoPhysics:
         else:
             self._filter.apply(self.ctrl)
             acting = self._filter.acting.numpy()
-        with quiet_warnings():
+        with quiet_mujoco():
             self._advance(acting.astype(float))
 
     def _advance(self, ctrl: np.ndarray) -> None:
