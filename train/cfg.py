@@ -102,10 +102,10 @@ class RewardCfg:
     """Amplitude and length scale [m] of the near reaching term."""
     wide: Range = (1.0, 0.3)
     """Amplitude and length scale [m] of a third reaching term in chains of stages, for the approach to an object."""
-    completion: float = 250.0
+    completion: float = 500.0
     """In chains, reward of each completed stage, once in an episode, of the last one when object 1 has come to rest in
-    place: more than the reaching terms bring within the horizon of the discount, so that the next stage pays off. The
-    value function goes on beyond that end as beyond the end of time, so that the last stage counts for more."""
+    place, which ends the episode: more than twice what the reaching terms bring within the horizon of the discount, so
+    that trying the next stage pays off even where it fails as often as it succeeds."""
     stage: float = 0.0
     """In chains, reward per step for each completed stage. An object dropped in a later stage then costs as much as all
     stages before were worth, so that policies learn not to try."""
@@ -418,6 +418,24 @@ class TrainCfg:
 
     def __post_init__(self) -> None:
         check_cfg(self)
+
+    @staticmethod
+    def for_stage(stage: str) -> TrainCfg:
+        """Return the defaults of a training of a stage, as ``concent train --stage`` has them.
+
+        The chain of all stages, "all", has more worlds and reset states, explores more, takes larger steps of the
+        joints' commands, since the way to the objects is long, and simulates pyramidal cones, which are faster.
+
+        Example:
+            >>> import concent_warp as cw
+            >>> cw.TrainCfg.for_stage("all").environment.worlds
+            8192
+        """
+        if stage != ALL:
+            return TrainCfg(environment=EnvironmentCfg(stage=stage))
+        action, reset = ActionCfg(turn=0.012), ResetCfg(states=4096, free=0.2)
+        environment = EnvironmentCfg(stage=ALL, worlds=8192, cone="pyramidal", action=action, reset=reset)
+        return TrainCfg(environment=environment, ppo=PpoCfg(iterations=334, entropy=0.005))
 
     def save(self, path: Path) -> None:
         """Write a TOML file atomically; None values are left out."""

@@ -31,8 +31,9 @@ import tyro
 
 from benchmarks.pages import machine
 from benchmarks.train.cases import CASES, Case, material
+from concent_warp.cli.commands.train import given_stage
 from concent_warp.files import write_text
-from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.cfg import LAST, TrainCfg
 from concent_warp.train.learning.metrics import CURVE
 from concent_warp.train.run import TrainingRun, train_run
 
@@ -136,7 +137,8 @@ def settings(args: Args, case: Case, seed: int) -> TrainCfg:
 
 def changed(settings: Mapping[str, Any]) -> str:
     """Return the settings of a training that are not the default, as options, but for those that belong to a case."""
-    mine, default = flat(settings), flat(json.loads(json.dumps(asdict(TrainCfg()))))
+    mine = flat(settings)
+    default = flat(json.loads(json.dumps(asdict(TrainCfg.for_stage(mine.get("environment.stage", LAST))))))
     parts = []
     for name, value in mine.items():
         if name in default and value != default[name] and name not in OF_A_CASE:
@@ -242,7 +244,8 @@ def pack(args: Args) -> None:
 
 def main() -> None:
     """Train what is left."""
-    args = tyro.cli(Args, description=__doc__)
+    defaults = replace(TrainCfg.for_stage(given_stage(sys.argv)), checkpoint=25)
+    args = tyro.cli(Args, description=__doc__, default=Args(out=tyro.MISSING, train=defaults))
     if args.one is not None:
         train_one(args, *args.one)
         return

@@ -154,9 +154,11 @@ def _run(command: str, arguments: Sequence[str]) -> None:
         module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
         with named_as(option_namer(module.Arguments)):
             with _one_sentence(command), readable_help(command, everything=ALL in arguments):
+                given = ["--help" if one == ALL else one for one in arguments]
                 settings = tyro.cli(
                     module.Arguments,
-                    args=["--help" if one == ALL else one for one in arguments],
+                    args=given,
+                    default=module.Arguments.default(given) if hasattr(module.Arguments, "default") else None,
                     prog=f"concent {command}",
                     description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
                     config=(tyro.conf.HelptextFromCommentsOff,),

@@ -19,7 +19,7 @@ from concent_warp.cli import main
 from concent_warp.deploy.improve.mend import Mend, advice, mend
 from concent_warp.deploy.improve.page import chart
 from concent_warp.deploy.improve.rounds import RoundsProgress
-from concent_warp.deploy.improve.steps import Setting, trial_files, with_effects
+from concent_warp.deploy.improve.steps import Setting, training_settings, trial_files, with_effects
 from concent_warp.deploy.setting_options import as_options, changed_settings, with_settings
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from tests.scenes.swinging import DAMPING, drawing, swung
@@ -108,7 +108,9 @@ def understood(line: str) -> tuple[str, Any]:
     concent, name, *arguments = shlex.split(line)
     assert concent == "concent"
     module = import_module(f"concent_warp.cli.commands.{name}")
-    return name, tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.HelptextFromCommentsOff,))
+    default = module.Arguments.default(arguments) if name == "train" else None
+    config = (tyro.conf.HelptextFromCommentsOff,)
+    return name, tyro.cli(module.Arguments, args=arguments, default=default, config=config)
 
 
 def test_the_page_has_success_causes_and_commands(interrupted: Path) -> None:
@@ -229,6 +231,10 @@ def test_settings_are_options_of_the_command_that_understands_them() -> None:
     assert changed_settings(cfg, cw.TrainCfg()) == names
     line = f"concent train demo.h5 --model model.toml {as_options(changed_settings(cfg, cw.TrainCfg()))}"
     assert understood(line)[1].train == cfg
+    chain = with_settings(cw.TrainCfg.for_stage("all"), {"ppo.entropy": 0.002})
+    line = f"concent train demo.h5 --model model.toml {as_options(training_settings(chain))}"
+    assert line.endswith("--environment.stage all --ppo.entropy 0.002")
+    assert understood(line)[1].train == chain
 
 
 def test_steps_weigh_as_long_as_they_took() -> None:

@@ -59,13 +59,16 @@ class StepResult:
     """Dropped, severe, diverged."""
     success: bool
     time_out: bool
+    """Whether the episode ended by time alone."""
+    rested: bool
+    """Whether it ended since object 1 has come to rest."""
     episode: EpisodeState
     """After the step, before a new episode."""
 
     @property
     def done(self) -> bool:
         """Whether the episode has ended."""
-        return any(self.failure) or self.time_out
+        return any(self.failure) or self.time_out or self.rested
 
 
 @dataclass
@@ -282,14 +285,15 @@ class Reference:
         terms["stages"] += reward.completion * completed
         value = reward.scale * sum(terms.values()) / len(task.chained)
         result.length, result.total = episode.length + 1, episode.total + value
-        over = result.length >= self.steps or result.at_rest >= self.rest
+        rested = result.at_rest >= self.rest
+        over = result.length >= self.steps and not rested and not any(failure)
         dropped, severe, diverged = failure
-        return StepResult(ctrl, terms, value, (dropped, severe, diverged), success, over and not failed, result)
+        return StepResult(ctrl, terms, value, (dropped, severe, diverged), success, over, rested, result)
 
     def count(self, results: list[StepResult], overflow: int) -> None:
         """Add the results of a step in all worlds to the log."""
         ended = [one for one in results if one.done]
-        good = [one for one in ended if one.success and one.time_out]
+        good = [one for one in ended if one.success and not any(one.failure)]
         if ended:
             keep = np.exp(-len(ended) / len(results))
             self.success_average = keep * self.success_average + (1 - keep) * len(good) / len(ended)
@@ -300,7 +304,7 @@ class Reference:
             "time outs": sum(one.time_out for one in ended),
             **{name: sum(one.failure[k] for one in ended) for k, name in enumerate(("dropped", "severe", "diverged"))},
             "return": sum(one.episode.total for one in ended), "length": sum(one.episode.length for one in ended),
-            "chains": len(chains), "chain success": sum(one.success and one.time_out for one in chains),
+            "chains": len(chains), "chain success": sum(one.episode.from_start for one in good),
         }  # fmt: skip
         for k, s in enumerate(self.task.chained):
             name = f"met {self.task.events.stages[s].name}"

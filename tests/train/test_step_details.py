@@ -168,8 +168,9 @@ def test_durations_are_rounded_to_control_steps_and_at_least_one(seconds, steps)
     environment, physics = at_places(task, [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], rest)
     for k in range(steps):
         assert environment.max_episode_length == 1000
-        done = environment.step(still(environment))[2]
+        _, _, done, extras = environment.step(still(environment))
         assert done.tolist() == [k == steps - 1, False]
+        assert not extras["time_outs"].any()  # a task that is done has nothing beyond its end
     assert physics.qpos.shape[0] == 2
 
 

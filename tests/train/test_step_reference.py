@@ -99,7 +99,8 @@ def test_steps_are_those_of_the_reference(case):
                 close(physics.ctrl[world], one.ctrl, atol=1e-6)
             episodes[world] = episode
             seen.update(kind for kind, was in zip(("dropped", "severe", "diverged"), one.failure, strict=True) if was)
-            seen.update({"success": one.success, "time out": one.time_out, "within": episode.within > 0})
+            seen.update({"success": one.success, "time out": one.time_out, "rested": one.rested})
+            seen["within"] += episode.within > 0
             seen[f"stage {episode.stage}"] += 1
         assert environment.stage.tolist() == [one.stage for one in episodes]
         assert environment._from_start.tolist() == [one.from_start for one in episodes]
@@ -116,7 +117,8 @@ def test_steps_are_those_of_the_reference(case):
             assert log.keys() == expected.keys()
             for name, value in expected.items():
                 assert log[name] == pytest.approx(value, rel=1e-4, abs=1e-4), name
-    kinds_seen = {"dropped", "diverged", "success", "time out", *(f"stage {s}" for s in task.chained)}
+    kinds_seen = {"dropped", "diverged", "success", *(f"stage {s}" for s in task.chained)}
+    kinds_seen.add("rested" if reference.chained and task.target_position is not None else "time out")
     if cfg.collision == "vcp" and task.objects:
         kinds_seen.add("severe")
     assert {kind for kind, count in seen.items() if count} >= kinds_seen, seen

@@ -170,6 +170,7 @@ class Environment(VecEnv):
         self.reward = torch.zeros(n, device=device)
         self.done = torch.zeros(n, dtype=torch.bool, device=device)
         self.time_out = torch.zeros(n, dtype=torch.bool, device=device)
+        """Whether the last step ended by time alone: the value function goes on there, see `rsl_rl`'s PPO."""
         self.failure = torch.zeros(n, 3, dtype=torch.bool, device=device)
         """Whether the last step ended in a drop, a severe virtual collision or divergence, shape (N, 3)."""
         self.success = torch.zeros(n, dtype=torch.bool, device=device)
@@ -430,9 +431,9 @@ class Environment(VecEnv):
 
         self.episode_length_buf += 1
         self._return += self.reward
-        finished = (self.episode_length_buf >= self.max_episode_length) | (self._steps_at_rest >= self._rest)
-        self.time_out.copy_(finished & ~failed)
-        self.done.copy_(failed | self.time_out)
+        over, rested = self.episode_length_buf >= self.max_episode_length, self._steps_at_rest >= self._rest
+        self.time_out.copy_(over & ~rested & ~failed)
+        self.done.copy_(failed | rested | over)
         self._divergence.record(diverged, (*self._before, *p.mocap, self._worlds))
         self._count(terms)
         state = p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage
@@ -478,10 +479,11 @@ class Environment(VecEnv):
     def _count(self, terms: torch.Tensor) -> None:
         """Add a step to the sums of the log, and update the running success rate."""
         p, ended = self.physics, self.done.double()
-        succeeded, chains = self.success & self.time_out, self.done & self._from_start
+        succeeded = self.success & self.done & ~self.failure.any(dim=1)
+        chains = self.done & self._from_start
         # Exponential average: earlier episodes weigh 1 / e once as many episodes as worlds have ended.
         keep = torch.exp(-ended.sum() / self.num_envs)
-        share = (self.done & succeeded).double().sum() / ended.sum().clamp(min=1.0)
+        share = succeeded.double().sum() / ended.sum().clamp(min=1.0)
         self._success_average.copy_(torch.lerp(share, self._success_average.double(), keep))
         outcomes = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
         sums = [(ended * self._return).sum(), (ended * self.episode_length_buf).sum()]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,7 +18,7 @@ from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import check_run_folder, processes
-from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.cfg import LAST, TrainCfg
 
 if TYPE_CHECKING:
     from concent_warp.train.learning.ppo import Iteration
@@ -49,7 +51,8 @@ class Arguments:
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     stage: str | None = None
-    """Stage to train; last, the default, for the last one, all for the chain of all; short for --environment.stage."""
+    """Stage to train; last, the default, for the last one, all for the chain of all, for which some other options have
+    other defaults; short for --environment.stage."""
     worlds: Worlds | None = None
     """Parallel environments; short for --environment.worlds."""
     reward: Literal["contact", "engineered"] | None = None
@@ -62,6 +65,11 @@ class Arguments:
     """Iterations of PPO; short for --ppo.iterations."""
     train: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
 
+    @classmethod
+    def default(cls, given: Sequence[str]) -> Arguments:
+        """Return the defaults of the options, which depend on the stage that some of the given ones name."""
+        return cls(recording=tyro.MISSING, model=tyro.MISSING, train=TrainCfg.for_stage(given_stage(given)))
+
     def cfg(self) -> TrainCfg:
         """Return the settings with the short forms put in their places."""
         environment = self.train.environment
@@ -71,6 +79,13 @@ class Arguments:
             environment = replace(environment, reward=replace(environment.reward, kind=self.reward))
         ppo = self.train.ppo if self.iterations is None else replace(self.train.ppo, iterations=self.iterations)
         return replace(self.train, environment=environment, ppo=ppo)
+
+
+def given_stage(options: Sequence[str]) -> str:
+    """Return the stage that options name, the last one by default; ``--stage`` has precedence."""
+    words = [part for option in options for part in option.split("=", 1)]
+    named = {name: value for name, value in pairwise(words) if name in ("--stage", "--environment.stage")}
+    return named.get("--stage", named.get("--environment.stage", LAST))
 
 
 def run(arguments: Arguments) -> Policy:

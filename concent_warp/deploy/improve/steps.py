@@ -234,8 +234,14 @@ def trained(setting: Setting, one: ImprovementRound, chosen: Mend, folder: Path,
     )
     names = [setting.recording.source, "--demonstration", demonstration, "--model", str(path)]
     names += ["--events", str(before.folder / EVENTS), "--begin-with", one.policy, "--out", str(folder / POLICY)]
-    command = f"concent train {shlex.join(names)}{_device(setting)} {as_options(changed_settings(cfg, TrainCfg()))}"
+    command = f"concent train {shlex.join(names)}{_device(setting)} {as_options(training_settings(cfg))}"
     return replace(one, mend=chosen.text, commands=(*one.commands, command.strip()))
+
+
+def training_settings(cfg: TrainCfg) -> dict[str, Any]:
+    """Return the options of ``concent train`` that lead to these settings: the stage, and what is not its default."""
+    stage = cfg.environment.stage
+    return {"environment.stage": stage, **changed_settings(cfg, TrainCfg.for_stage(stage))}
 
 
 def training_cfg(cfg: ImproveCfg, before: TrainCfg, number: int) -> TrainCfg:
