@@ -24,6 +24,7 @@ import os
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ import tyro
 from benchmarks.diagnose.suggest_pool import run_all
 from benchmarks.diagnose.suggest_report import write_report
 from benchmarks.diagnose.suggest_sets import SEEDS, SuggestSet, suggest_sets
-from benchmarks.diagnose.suggest_stages import rows_of
+from benchmarks.diagnose.suggest_stages import rows_of, run_task
 from concent_warp.files import write_text
 
 OUT = Path("runs/suggest")
@@ -53,7 +54,9 @@ class Args:
     limit: float = float("inf")
     """Time after which nothing is begun, and what runs is stopped [s]."""
     out: Path = OUT
-    """Where results and pieces lie, in a folder for each data set."""
+    """Where results lie, in a folder for each data set."""
+    pieces: Path | None = None
+    """Where pieces of what is not done lie, from which it goes on; `--out` with "_pieces" by default."""
     list: bool = False
     """Print the names of the data sets."""
     report: bool = False
@@ -72,11 +75,13 @@ def main(args: Args) -> None:
     if not args.report:
         random.Random(0).shuffle(chosen)
         chosen.sort(key=lambda s: s.repeat)  # all data sets once, then again on other seeds
-        whole = run_all(chosen, args.out, max(args.jobs, 1), args.limit, lambda text: print(text, flush=True))
+        pieces = args.pieces or args.out.with_name(f"{args.out.name}_pieces")
+        work = partial(run_task, pieces=pieces)
+        whole = run_all(chosen, args.out, max(args.jobs, 1), args.limit, lambda text: print(text, flush=True), work)
         rows = rows_of(sets, args.out)
         write_text(args.out / "rows.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
         print("\n".join(_line(row) for row in rows))
-    if args.report or (whole and not (args.rigs or args.names)):
+    if args.report or (whole and not (args.rigs or args.names or args.seeds < SEEDS)):
         write_report(rows_of(sets, args.out), len(sets))
 
 

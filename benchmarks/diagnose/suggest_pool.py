@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from benchmarks.diagnose.suggest_sets import SuggestSet
-from benchmarks.diagnose.suggest_stages import Task, begin, begin_suggestion, next_tasks, run_task
+from benchmarks.diagnose.suggest_stages import Task, begin, begin_suggestion, next_tasks
 
 ORDER = {"first": 0, "second": 1, "suggest": 2}
 """First diagnoses come first, so that all groups are known early; then what ends a data set that is begun."""
@@ -39,7 +39,7 @@ def run_all(
     jobs: int,
     limit: float,
     tell: Callable[[str], None],
-    work: Callable[[SuggestSet, Task, Path], None] = run_task,
+    work: Callable[[SuggestSet, Task, Path], None],
 ) -> bool:
     """Run what is left of data sets in their order, and return whether all was done.
 
@@ -49,7 +49,7 @@ def run_all(
         jobs: Stages at a time.
         limit: Time after which nothing is begun and what runs is stopped [s].
         tell: Told each stage that ends.
-        work: Runs a stage.
+        work: Runs a stage, given the folder of the data set.
     """
     started, running, failed = time.monotonic(), list[_Running](), set[tuple[str, Task]]()
     names = {one.name: k for k, one in enumerate(sets)}

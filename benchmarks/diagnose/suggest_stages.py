@@ -53,15 +53,23 @@ def _is_open(result: dict[str, Any]) -> bool:
     return "outcome" not in result and "like" not in result
 
 
-def run_task(one: SuggestSet, task: Task, folder: Path) -> None:
-    """Run a stage; an error is its result."""
+def run_task(one: SuggestSet, task: Task, folder: Path, pieces: Path) -> None:
+    """Run a stage; an error is its result.
+
+    Args:
+        one: The data set.
+        task: The stage.
+        folder: Folder of its results.
+        pieces: Where pieces lie from which interrupted stages of all data sets go on.
+    """
+    own = pieces / one.name
     with limit_simulations(1):
         if task[0] == "first":
-            _first(one, folder)
+            _first(one, folder, own / "first")
         elif task[0] == "suggest":
-            _suggestions(one, folder)
+            _suggestions(one, folder, own / "suggestion")
         else:
-            _second(one, folder, task[1])
+            _second(one, folder, task[1], own / task[1])
 
 
 def begin(one: SuggestSet, folder: Path) -> None:
@@ -76,12 +84,12 @@ def begin_suggestion(folder: Path) -> None:
     _write(folder / "methods.json", list(METHODS))
 
 
-def _first(one: SuggestSet, folder: Path) -> None:
+def _first(one: SuggestSet, folder: Path, pieces: Path) -> None:
     """Diagnose the first recording."""
     begun = time.perf_counter()
     try:
         recording, scene = first_recording(one)
-        found, seconds = _diagnosed(Model(scene), recording, one.base.seed, folder / "pieces")
+        found, seconds = _diagnosed(Model(scene), recording, one.base.seed, pieces)
         asked = open_group(found.groups, list(one.base.magnitudes)) if found.verdict == "group" else None
         group, true = asked or (None, None)
         row = {"first": _told(found, seconds), "group": group, "true": true, "diagnosis": found.to_json()}
@@ -90,7 +98,7 @@ def _first(one: SuggestSet, folder: Path) -> None:
     _write(folder / "first.json", {**row, "seconds": time.perf_counter() - begun})
 
 
-def _suggestions(one: SuggestSet, folder: Path) -> None:
+def _suggestions(one: SuggestSet, folder: Path, pieces: Path) -> None:
     """Choose the motions of all methods that are not done; fits of hypotheses and ratings of motions are shared."""
     recording, scene = first_recording(one)
     diagnosis = (_read(folder / "first.json") or {})["diagnosis"]
@@ -100,7 +108,7 @@ def _suggestions(one: SuggestSet, folder: Path) -> None:
         begun = time.perf_counter()
         try:
             cfg = SuggestCfg(method=method, seed=one.base.seed)
-            found = suggest(Model(scene), recording, cfg, diagnosis=diagnosis, state=folder / "pieces" / "suggestion")
+            found = suggest(Model(scene), recording, cfg, diagnosis=diagnosis, state=pieces)
             result: dict[str, Any] = {**found.to_json(), "seconds": time.perf_counter() - begun}
             if found.recording is None:
                 result["outcome"] = "none"
@@ -139,14 +147,14 @@ def _arrays(d: Demonstration) -> dict[str, np.ndarray]:
     return found
 
 
-def _second(one: SuggestSet, folder: Path, method: str) -> None:
+def _second(one: SuggestSet, folder: Path, method: str, pieces: Path) -> None:
     """Perform what a method suggests, and diagnose both recordings."""
     path = folder / f"{method}.json"
     result, first = _read(path) or {}, _read(folder / "first.json") or {}
     try:
         recording, scene = first_recording(one)
         both = merged([recording, second_recording(one, load_recording(folder / f"{method}.h5"))])
-        found, seconds = _diagnosed(Model(scene), both, one.base.seed, folder / "pieces" / method)
+        found, seconds = _diagnosed(Model(scene), both, one.base.seed, pieces)
         result["second"] = _told(found, seconds)
         result["outcome"] = outcome(found.groups, first["group"], first["true"])
     except Exception as error:

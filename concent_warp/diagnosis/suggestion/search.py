@@ -99,6 +99,8 @@ class Search:
     ) -> tuple[Candidate, Forecast] | None:
         """Return the best of candidates, and of another one, when all uncertainties are taken into account."""
         for one in sorted((r for r in rated if r.inside), key=lambda r: -r.score)[:FINALISTS]:
+            if best is not None and self.score(best[1]) >= self.enough:
+                break
             self.report(0.3 if one.candidate.source == "menu" else 0.95, f"comparing motions: {one.candidate.name}")
             key = f"careful {one.key}"
             if key not in self.evaluations.known:
