@@ -151,11 +151,7 @@ def forecasts(
             owner += [k] * len(cut)
     try:
         base = [_predicted(h, windows, engine, {w: of[i] for w, of in whole.items()}) for i, h in enumerate(hypotheses)]
-        slopes, nominal = list[list[np.ndarray]](), dict[str, list[np.ndarray]]()
-        for h, of_h in zip(hypotheses, base, strict=True):
-            slopes.append(_parameter_slopes(h, windows, of_h, engine, step, nominal))
-            if not careful:  # what nominal values change differs little between hypotheses
-                nominal = nominal or _nominal_slopes(h, slopes[0])
+        slopes = [_parameter_slopes(h, windows, of_h, engine, step) for h, of_h in zip(hypotheses, base, strict=True)]
         of_starts = _start_slopes(hypotheses[0], windows, base[0], engine, step) if starts else None
         scatter = _scatter(hypotheses[0], recorded, windows, base[0], engine) if careful else [None] * len(windows)
     except (ConcentError, ValueError, mujoco.FatalError):
@@ -230,63 +226,28 @@ def _predicted(
     return [found[w] for w in range(len(windows))]
 
 
-def _nominal_slopes(hypothesis: Hypothesis, slopes: Sequence[np.ndarray]) -> dict[str, list[np.ndarray]]:
-    """Return the columns (count,) of slopes that belong to nominal values, one a window, by their names."""
-    names = _nominal_names(hypothesis)
-    column = np.cumsum(hypothesis.std > 0) - 1
-    return {
-        name: [of_window[:, column[k]] for of_window in slopes] for k, name in enumerate(names) if hypothesis.std[k] > 0
-    }
-
-
-def _nominal_names(hypothesis: Hypothesis) -> list[str]:
-    """Return the names of the parameters that are nominal values within their tolerance."""
-    compiled, names = replace(hypothesis.model, effects=()).compile(), list[str]()
-    for added in hypothesis.model.effects:
-        if len(names) < hypothesis.nominal:
-            names += [p.name for p in added.effect.parameters(compiled)]
-    return names[: hypothesis.nominal]
-
-
 def _parameter_slopes(
-    hypothesis: Hypothesis,
-    windows: Sequence[Window],
-    base: Sequence[Readings],
-    engine: EngineName,
-    step: float,
-    known: Mapping[str, Sequence[np.ndarray]],
+    hypothesis: Hypothesis, windows: Sequence[Window], base: Sequence[Readings], engine: EngineName, step: float
 ) -> list[np.ndarray]:
-    """Return the change of the readings per standard deviation of free parameters, (count, P) a window.
-
-    Args:
-        hypothesis: The hypothesis.
-        windows: Windows.
-        base: What it predicts in each.
-        engine: Which engine simulates.
-        step: Step of finite differences [standard deviations].
-        known: Slopes of some nominal values, (count,) a window, that are not simulated.
-    """
+    """Return the change of the readings per standard deviation of free parameters, (count, P) a window."""
     prediction = Prediction(hypothesis.model, (), windows, engine=engine)
-    free = [int(k) for k in np.flatnonzero(hypothesis.std > 0)]
-    given = {k: known[p.name] for k, p in enumerate(prediction.parameters[: hypothesis.nominal]) if p.name in known}
+    free = np.flatnonzero(hypothesis.std > 0)
     low, high = (np.array([getattr(p, name) for p in prediction.parameters]) for name in ("low", "high"))
-    requests, steps = [], dict[int, float]()
-    for k in (k for k in free if k not in given):
+    requests, steps = [], []
+    for k in free:
         size = step * hypothesis.std[k]
         size = size if prediction.start[k] + size <= high[k] or prediction.start[k] - size < low[k] else -size
         moved = prediction.start.copy()
         moved[k] += size
-        steps[k] = size / hypothesis.std[k]
+        steps.append(size / hypothesis.std[k])
         requests += [SimulationRequest(w, moved) for w in range(len(windows))]
-    seen, count, found = _observed(hypothesis, prediction, requests), len(windows), []
-    for w, window in enumerate(windows):
-        columns = {k: own[w] for k, own in given.items()}
-        columns |= {
-            k: difference_in_noise(window, seen[i * count + w], base[w]) / size
-            for i, (k, size) in enumerate(steps.items())
-        }
-        found.append(np.stack([columns[k] for k in free], axis=1) if len(free) else np.zeros((window.count, 0)))
-    return found
+    seen, count = _observed(hypothesis, prediction, requests), len(windows)
+    return [
+        np.stack([difference_in_noise(w, seen[i * count + k], base[k]) / size for i, size in enumerate(steps)], axis=1)
+        if steps
+        else np.zeros((w.count, 0))
+        for k, w in enumerate(windows)
+    ]
 
 
 def _start_slopes(
