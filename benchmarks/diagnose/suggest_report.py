@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.diagnose.suggest_sets import PART, summary
+from benchmarks.diagnose.suggest_sets import PART, SEEDS, summary
 from benchmarks.pages import FOLDER, machine_line, table, write_page
 from concent_warp.diagnosis.suggestion.cfg import Method
 from concent_warp.files import write_text
@@ -21,6 +21,8 @@ TITLES = {
     "menu": "best of the fixed menu",
     "random": "random trajectory",
 }
+TIME_OUT = "time-out"
+"""Outcome of what was begun and had not ended when the time was up."""
 DATA = FOLDER / "data" / f"{NAME}.jsonl"
 
 
@@ -53,26 +55,33 @@ def write_report(rows: Sequence[Mapping[str, Any]], count: int) -> None:
 def page(rows: Sequence[Mapping[str, Any]], count: int) -> str:
     """Return the page."""
     whole = [row for row in rows if "error" not in row]
-    asked = [row for row in whole if row["group"] is not None]
+    groups = [row for row in whole if row["group"] is not None]
+    asked = [row for row in groups if row["methods"]]
     hosts = " ".join(dict.fromkeys(machine_line(row["machine"]) for row in rows))
     separable = [row for row in asked if row["methods"]["best"]["outcome"] != "none"]
-    share, done, failed, groups = f"{100 * PART:.0f} %", len(whole), len(rows) - len(whole), len(asked)
+    late = sum(row.get("error") == TIME_OUT for row in rows)
+    share, failed = f"{100 * PART:.0f} %", len(rows) - len(whole) - late
     hours = sum(row["seconds"] for row in rows) / 3600
+    unanswered = sum(any(m["outcome"] == TIME_OUT for m in row["methods"].values()) for row in asked)
     text = f"""# Suggested recordings
 
 Written by `benchmarks/diagnose/suggest.py`; do not edit. {hosts}
 
 `python -m benchmarks.diagnose.suggest`: how often the recording that `concent suggest` asks for resolves a group,
 effects that a diagnosis cannot distinguish. The data are those of the [hidden effects](hidden_effects.md) with one or
-two effects of the library and one demonstration, on other seeds. The first recording is the first {share} of each, of
-its time or of its throws, since short recordings leave more open. Of {count} data sets {done} are done and {failed}
-ended in an error; {groups} ended in a group that the hidden effect is in. {hours:.1f} hours of one core in all.
+two effects of the library and one demonstration, each on {SEEDS} seeds, none of them used there. The first recording
+is the first {share} of each, of its time or of its throws, since short recordings leave more open.
+
+Of {count} data sets {len(rows)} were begun, in random order, those of the first seed first; {late} of these were
+stopped in the first diagnosis when the time was up, and {failed} ended in an error. {len(groups)} ended in a group that
+the hidden effect is in; for {len(asked)} of these motions were looked for, in the same order. Each of them counts:
+{unanswered} that had not ended when the time was up are failures ("time-out"). {hours:.1f} hours of one core in all.
 
 Each motion is performed in Reality with the same hidden effect, and both recordings are diagnosed together. All methods
 have the same longest duration and the same limits; none knows the truth.
 
 """
-    head = ["motion", "data sets", "right", "wrong", "still open", "nothing suggested", "error"]
+    head = ["motion", "data sets", "right", "wrong", "still open", "nothing suggested", "time-out", "error"]
     text += table(head, [_shares(asked, method) for method in METHODS])
     text += """
 *Right*: the hidden effect is named alone. *Wrong*: others are named without it. *Still open*: it is named with others.
@@ -83,7 +92,7 @@ and drive gain of a pendulum, whose ratio alone acts. A random trajectory is per
         text += f"\nWhere something was suggested by the first method ({len(separable)} data sets):\n\n"
         text += table(head, [_shares(separable, method) for method in METHODS])
     text += "\n## Data sets\n\nGroup of the first diagnosis, the hidden effect in bold; what each method came to.\n\n"
-    text += table(["data set", "group", *METHODS, "motion", "duration [s]"], [_row(row) for row in asked])
+    text += table(["data set", "group", *METHODS, "motion", "duration [s]"], [_row(row) for row in groups])
     text += "\n## Time\n\nSeconds on one core, median.\n\n"
     text += table(["rig", "groups", "first diagnosis", "suggestion", "second diagnosis"], _times(asked))
     text += """
@@ -99,16 +108,17 @@ def _shares(rows: Sequence[Mapping[str, Any]], method: str) -> list[str]:
     """Return the row of a method."""
     found, count = summary(rows, method), max(len(rows), 1)
     cells = [f"{found[key]} ({100 * found[key] / count:.0f} %)" for key in ("right", "wrong", "open", "none")]
-    return [TITLES[method], str(len(rows)), *cells, str(found["error"])]
+    return [TITLES[method], str(len(rows)), *cells, str(found[TIME_OUT]), str(found["error"])]
 
 
 def _row(row: Mapping[str, Any]) -> list[str]:
     """Return the row of a data set."""
     group = ", ".join(f"**{name}**" if name == row["true"] else name for name in row["group"])
-    best = row["methods"]["best"]
+    best = row["methods"].get("best", {})
     name = best.get("name") or "-"
     duration = f"{best['duration']:.1f}" if best.get("duration") else "-"
-    return [f"`{row['name']}`", group, *(row["methods"][m]["outcome"] for m in METHODS), name, duration]
+    outcomes = [row["methods"].get(m, {"outcome": "not begun"})["outcome"] for m in METHODS]
+    return [f"`{row['name']}`", group, *outcomes, name, duration]
 
 
 def _times(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:

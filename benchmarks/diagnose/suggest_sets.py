@@ -19,6 +19,10 @@ PART = 0.1
 """Share of each recording that is the first one: of its time, or of its throws. Short recordings leave more open."""
 SHIFT = 8000
 """Added to the seeds of `hidden_effects_data.cases`, so that the data are those of no other page."""
+SEEDS = 6
+"""Seeds of each data set: other noise and other motions."""
+STRIDE = 100
+"""Between two seeds of a data set."""
 Outcome = Literal["right", "wrong", "open"]
 
 
@@ -29,18 +33,24 @@ class SuggestSet:
     name: str
     base: DataSet
     part: float
+    repeat: int = 0
+    """Which of its seeds it is made with."""
 
 
 def suggest_sets() -> list[SuggestSet]:
     """Return all data sets with one or two hidden effects of the library, and one demonstration, cut to a part.
 
-    Rigs that perform no given motions are left out (`record_rig_motion`).
+    All of them on the first seed, then on the others, since few end in a group. Rigs that perform no given motions are
+    left out (`record_rig_motion`).
     """
     found = []
-    for case in cases():
-        if case.kind not in ("single", "pair") or case.demonstrations > 1 or RIGS[case.rig].recorder is not None:
-            continue
-        found.append(SuggestSet(f"{case.name}-part", replace(case, seed=case.seed + SHIFT), PART))
+    for repeat in range(SEEDS):
+        end = f"-{repeat}" if repeat else ""
+        for case in cases():
+            if case.kind not in ("single", "pair") or case.demonstrations > 1 or RIGS[case.rig].recorder is not None:
+                continue
+            base = replace(case, seed=case.seed + SHIFT + STRIDE * repeat)
+            found.append(SuggestSet(f"{case.name}-part{end}", base, PART, repeat))
     return found
 
 
@@ -114,8 +124,8 @@ def outcome(groups: Sequence[Sequence[str]], group: Sequence[str], true: str) ->
 
 
 def summary(rows: Sequence[Mapping[str, Any]], method: str) -> dict[str, int]:
-    """Return how often a method resolved a group: right, wrong, open, and how often it suggested nothing."""
-    found = {"right": 0, "wrong": 0, "open": 0, "none": 0, "error": 0}
+    """Return how often a method resolved a group: right, wrong, open, and how often it suggested nothing or failed."""
+    found = {"right": 0, "wrong": 0, "open": 0, "none": 0, "time-out": 0, "error": 0}
     for row in rows:
         found[row["methods"][method]["outcome"]] += 1
     return found

@@ -92,6 +92,13 @@ class SuggestCfg:
     """Trajectories that are simulated in the search of each kind."""
     population: Annotated[int, Bounds(4, 4096)] = 12
     """Trajectories in one batch of simulations."""
+    enough: Positive = 100.0
+    """Evidence over what is needed from which on no better motion is looked for [-]: of all pairs of hypotheses, as the
+    search averages them."""
+    patience: Count = 3
+    """Batches without a better trajectory after which a search ends."""
+    min_gain: Positive = 0.01
+    """What counts as better, in the logarithm that the search maximises [-]: odds that are lower by 1 %."""
     max_hypotheses: Annotated[int, Bounds(2, 64)] = 6
     """Most hypotheses that are compared, the likeliest first; the cost grows with their number."""
     max_interval: Positive = 0.25

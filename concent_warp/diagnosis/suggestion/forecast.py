@@ -14,9 +14,10 @@ discriminating between two rival models", Biometrika 62, 1975), with the data at
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,6 +26,7 @@ from scipy.linalg import block_diag
 from concent_warp.diagnosis.experiment.future_window import difference_in_noise, future_window
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.suggestion.hypotheses import Hypothesis
+from concent_warp.effects.effect import Reader
 from concent_warp.errors import ConcentError
 from concent_warp.fit.effects.observation import NumericalScatter, ObservedRecording, Window
 from concent_warp.fit.effects.observe import has_touchable_free_body, keeps_close
@@ -53,6 +55,16 @@ class Forecast:
     count: int
     """Readings of the motion."""
 
+    def plain(self) -> list[Any]:
+        """Return it in plain types."""
+        return [self.evidence.tolist(), self.separation.tolist(), [list(row) for row in self.channels], self.count]
+
+    @staticmethod
+    def of(plain: Sequence[Any]) -> Forecast:
+        """Return a forecast from what `plain` returned."""
+        evidence, separation, channels, count = plain
+        return Forecast(np.array(evidence), np.array(separation), tuple(map(tuple, channels)), int(count))
+
     def score(self, needed: float) -> float:
         """Return what a search maximises: minus the log of the mean odds that hypotheses stay confused.
 
@@ -73,6 +85,8 @@ class Course:
     """Shape (H, K + 1, nq)."""
     qvel: np.ndarray
     """Shape (H, K + 1, nv)."""
+    readings: tuple[Readings, ...] = ()
+    """What each hypothesis predicts of the whole motion."""
 
 
 def courses(
@@ -81,20 +95,23 @@ def courses(
     """Return the simulated motions, one batch a hypothesis; None where one of them does not stay finite."""
     windows = [future_window(recorded, motion, motion.duration) for motion in motions]
     kept = [w for w in windows if w is not None]
-    found = []
+    found, seen = [], []
     for hypothesis in hypotheses:
         prediction = Prediction(hypothesis.model, (), kept, engine=engine)
-        found.append(prediction.courses([SimulationRequest(w, prediction.start) for w in range(len(kept))]))
+        requests = [SimulationRequest(w, prediction.start) for w in range(len(kept))]
+        found.append(prediction.courses(requests))
+        seen.append(_read(hypothesis, prediction, requests, [course.reader for course in found[-1]]))
     dt, result, row = recorded.m.opt.timestep, [], 0
     for window in windows:
         if window is None:
             result.append(None)
             continue
         own = [of_hypothesis[row] for of_hypothesis in found]
+        readings = tuple(of_hypothesis[row] for of_hypothesis in seen)
         row += 1
         qpos, qvel = np.stack([c.qpos for c in own]), np.stack([c.qvel for c in own])
         finite = np.isfinite(qpos).all() and np.isfinite(qvel).all()
-        result.append(Course(dt * np.arange(qpos.shape[1]), qpos, qvel) if finite else None)
+        result.append(Course(dt * np.arange(qpos.shape[1]), qpos, qvel, readings) if finite else None)
     return result
 
 
@@ -124,14 +141,16 @@ def forecasts(
             numerical scatter of contacts counts as noise, as in a diagnosis, and refits are simulated.
         seed: Seed of the disturbances that determine that.
     """
-    windows, owner = [], []
+    windows, owner, whole = [], [], dict[int, tuple[Readings, ...]]()
     for k, motions in enumerate(candidates):
         for motion, course in motions:
             cut = _windows(recorded, motion, course, window, engine if careful else None, seed)
+            if len(cut) == 1 and cut[0].end == motion.duration and course.readings:
+                whole[len(windows)] = course.readings
             windows += cut
             owner += [k] * len(cut)
     try:
-        base = [_predicted(h, windows, engine) for h in hypotheses]
+        base = [_predicted(h, windows, engine, {w: of[i] for w, of in whole.items()}) for i, h in enumerate(hypotheses)]
         slopes = [_parameter_slopes(h, windows, of_h, engine, step) for h, of_h in zip(hypotheses, base, strict=True)]
         of_starts = _start_slopes(hypotheses[0], windows, base[0], engine, step) if starts else None
         scatter = _scatter(hypotheses[0], recorded, windows, base[0], engine) if careful else [None] * len(windows)
@@ -176,8 +195,18 @@ def _windows(
 
 def _observed(hypothesis: Hypothesis, prediction: Prediction, requests: Sequence[SimulationRequest]) -> list[Readings]:
     """Return what instruments read in some simulations of a hypothesis."""
+    return _read(hypothesis, prediction, requests, prediction.readers(requests))
+
+
+def _read(
+    hypothesis: Hypothesis,
+    prediction: Prediction,
+    requests: Sequence[SimulationRequest],
+    readers: Sequence[Reader],
+) -> list[Readings]:
+    """Return what instruments read in some simulations of a hypothesis, from what those of its model read."""
     found = []
-    for request, reader in zip(requests, prediction.readers(requests), strict=True):
+    for request, reader in zip(requests, readers, strict=True):
         read = reader
         for added, part in zip(hypothesis.model.effects, prediction.split, strict=True):
             if added.effect.measures:
@@ -186,10 +215,15 @@ def _observed(hypothesis: Hypothesis, prediction: Prediction, requests: Sequence
     return found
 
 
-def _predicted(hypothesis: Hypothesis, windows: Sequence[Window], engine: EngineName) -> list[Readings]:
-    """Return what a hypothesis predicts in each window."""
+def _predicted(
+    hypothesis: Hypothesis, windows: Sequence[Window], engine: EngineName, known: Mapping[int, Readings]
+) -> list[Readings]:
+    """Return what a hypothesis predicts in each window; what is known of some is not simulated again."""
     prediction = Prediction(hypothesis.model, (), windows, engine=engine)
-    return _observed(hypothesis, prediction, [SimulationRequest(w, prediction.start) for w in range(len(windows))])
+    fresh = [w for w in range(len(windows)) if w not in known]
+    seen = _observed(hypothesis, prediction, [SimulationRequest(w, prediction.start) for w in fresh])
+    found = dict(known) | dict(zip(fresh, seen, strict=True))
+    return [found[w] for w in range(len(windows))]
 
 
 def _parameter_slopes(

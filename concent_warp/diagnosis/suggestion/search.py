@@ -23,7 +23,9 @@ from concent_warp.diagnosis.suggestion.trajectories import Family, families
 from concent_warp.simulate.select import EngineName
 
 OUT_OF_LIMITS = 10.0
-"""Fall of the score of a candidate that exceeds limits, more for each unit of the excess."""
+"""How far the score of a candidate that exceeds limits is below 0, more for each unit of the excess."""
+FAILED = -1e9
+"""Score of a candidate that cannot be simulated."""
 TRIES = 30
 """Random trajectories that are tried until one is within the limits."""
 FINALISTS = 4
@@ -43,6 +45,13 @@ class Rated:
     """By how much it exceeds the limits [-]."""
     words: tuple[str, ...] = ()
     """What it exceeds."""
+    key: str = ""
+    """What it depends on, in short."""
+
+    @property
+    def inside(self) -> bool:
+        """Whether it is within the limits."""
+        return self.excess == 0 and self.score > FAILED
 
 
 @dataclass(frozen=True)
@@ -71,24 +80,42 @@ class Search:
 
     def run(self) -> Found:
         """Return the best candidate within the limits."""
-        method = self.cfg.method
+        method, best = self.cfg.method, None
         rated: list[Rated] = []
         if method == "random":
             rated = [self.random()]
         if method in ("best", "menu"):
-            rated += self.menu()
-        if method in ("best", "optimised"):
-            rated += self.optimised()
-        inside = [one for one in rated if one.excess == 0 and np.isfinite(one.score)]
-        best: tuple[Candidate, Forecast] | None = None
-        for source in ("menu", "optimised", "random"):
-            kind = sorted((r for r in inside if r.candidate.source == source), key=lambda r: -r.score)
-            for one in kind[:FINALISTS]:
-                self.report(0.95, f"comparing the best motions: {one.candidate.name}")
-                found = self.forecast([one.candidate], careful=True)[0]
-                if found is not None and (best is None or self.score(found) > self.score(best[1])):
-                    best = one.candidate, found
+            rated = self.menu()
+        if method != "optimised":
+            best = self._compared(rated)
+        if method == "optimised" or (method == "best" and (best is None or self.score(best[1]) < self.enough)):
+            searched = self.optimised()
+            best = self._compared(searched, best)
+            rated += searched
         return Found(best, min(rated, key=lambda r: r.excess).words if rated else ())
+
+    def _compared(
+        self, rated: Sequence[Rated], best: tuple[Candidate, Forecast] | None = None
+    ) -> tuple[Candidate, Forecast] | None:
+        """Return the best of candidates, and of another one, when all uncertainties are taken into account."""
+        for one in sorted((r for r in rated if r.inside), key=lambda r: -r.score)[:FINALISTS]:
+            if best is not None and self.score(best[1]) >= self.enough:
+                break
+            self.report(0.3 if one.candidate.source == "menu" else 0.95, f"comparing motions: {one.candidate.name}")
+            key = f"careful {one.key}"
+            if key not in self.evaluations.known:
+                (made,) = self.forecast([one.candidate], careful=True)
+                self.evaluations.add(key, None if made is None else made.plain())
+            plain = self.evaluations.known[key]
+            found = None if plain is None else Forecast.of(plain)
+            if found is not None and (best is None or self.score(found) > self.score(best[1])):
+                best = one.candidate, found
+        return best
+
+    @property
+    def enough(self) -> float:
+        """Score from which on no better motion is looked for."""
+        return float(np.log1p(self.cfg.enough))
 
     @cached_property
     def _open(self) -> list[Hypothesis]:
@@ -119,7 +146,7 @@ class Search:
 
     def _together(self, found: Sequence[Rated]) -> list[Rated]:
         """Return the best motions of an object, and those that add most to them, as one candidate."""
-        inside = sorted((r for r in found if r.excess == 0 and np.isfinite(r.score)), key=lambda r: -r.score)
+        inside = sorted((r for r in found if r.inside), key=lambda r: -r.score)
         chosen = [r.candidate for r in inside[:1]]
         for _ in range(self.cfg.trajectory.throws - 1 if chosen else 0):
             options = [joined([*chosen, r.candidate]) for r in inside if r.candidate not in chosen]
@@ -156,6 +183,7 @@ class Search:
         size = self.cfg.population
         evolution, best = DiagonalEvolution(family.size, size, rng), list[Rated]()
         generations = max(self.cfg.evaluations // size, 1)
+        highest, since = -np.inf, 0
         for k in range(generations):
             samples = evolution.ask()
             rated = self.rate(
@@ -166,6 +194,10 @@ class Search:
             evolution.tell(samples, np.array([r.score for r in rated]))
             best = sorted([*best, *rated], key=lambda r: -r.score)[:FINALISTS]
             report((k + 1) / generations)
+            now = max((r.score for r in best if r.inside), default=-np.inf)
+            highest, since = (now, 0) if now > highest + self.cfg.min_gain else (highest, since + 1)
+            if now >= self.enough or (np.isfinite(highest) and since >= self.cfg.patience):
+                break
         return best
 
     def random(self) -> Rated:
@@ -176,7 +208,7 @@ class Search:
             x = rng.normal(size=family.size)
             tried += self.rate([family.candidate(x, "random")], [(family.name, "random", x)], starts=family.starts)
             self.report(0.9 * (k + 1) / TRIES, "sampling a motion")
-            if tried[-1].excess == 0 and np.isfinite(tried[-1].score):
+            if tried[-1].inside:
                 break
         return min(tried, key=lambda r: (r.excess, -r.score)) if tried else _nothing()
 
@@ -194,12 +226,15 @@ class Search:
             self.evaluations.add(named[k], [found.score, found.excess, list(found.words)])
         known = [self.evaluations.known[key] for key in named]
         return [
-            Rated(candidate, -np.inf if score is None else float(score), float(excess), tuple(words))
-            for candidate, (score, excess, words) in zip(candidates, known, strict=True)
+            Rated(candidate, -np.inf if score is None else float(score), float(excess), tuple(words), key)
+            for candidate, key, (score, excess, words) in zip(candidates, named, known, strict=True)
         ]
 
     def _rated(self, candidates: Sequence[Candidate], *, starts: bool) -> list[Rated]:
-        """Return the ratings of candidates, simulated in one batch a hypothesis."""
+        """Return the ratings of candidates, simulated in one batch a hypothesis.
+
+        Those out of the limits are ranked by how far, and not forecast.
+        """
         if not candidates:
             return []
         owner = [k for k, c in enumerate(candidates) for _ in c.motions]
@@ -211,26 +246,29 @@ class Search:
                 parts[k] = None
             else:
                 row.append((motion, course))
-        whole = [part or [] for part in parts]
-        made = forecasts(
-            self._searched,
-            self.recorded,
-            whole,
-            self.engine,
-            window=self.cfg.window,
-            step=self.cfg.step,
-            starts=starts,
-        )
-        found = []
-        for candidate, part, forecast in zip(candidates, whole, made, strict=True):
-            over = [self.limits.excess(*each) for each in part]
+        found, within = list[Rated](), list[list[tuple[ProposedMotion, Course]]]()
+        for candidate, part in zip(candidates, parts, strict=True):
+            over = [self.limits.excess(*each) for each in part or ()]
             size, words = sum(e.size for e in over), tuple(dict.fromkeys(w for e in over for w in e.words))
-            if not part or forecast is None:
-                found.append(Rated(candidate, -np.inf, size if part else np.inf, words))
-                continue
-            score = self.score(forecast) - (OUT_OF_LIMITS * (1 + size) if size > 0 else 0.0)
-            found.append(Rated(candidate, score, size, words))
-        return [replace(r, score=-1e9, excess=min(r.excess, 1e9)) if not np.isfinite(r.score) else r for r in found]
+            within += [part] if part and size == 0 else []
+            found.append(Rated(candidate, -OUT_OF_LIMITS * (1 + size), size if part else np.inf, words))
+        made = iter(
+            forecasts(
+                self._searched,
+                self.recorded,
+                within,
+                self.engine,
+                window=self.cfg.window,
+                step=self.cfg.step,
+                starts=starts,
+            )
+        )
+        for k, one in enumerate(found):
+            if one.excess == 0:
+                forecast = next(made)
+                found[k] = replace(one, score=-np.inf if forecast is None else self.score(forecast))
+        failed = lambda r: not (np.isfinite(r.score) and np.isfinite(r.excess))  # noqa: E731
+        return [replace(r, score=FAILED, excess=min(r.excess, -FAILED)) if failed(r) else r for r in found]
 
     def forecast(self, candidates: Sequence[Candidate], *, careful: bool) -> list[Forecast | None]:
         """Return the forecasts of candidates with all uncertainties."""

@@ -119,7 +119,9 @@ def suggest(
     if not question.models:
         return Suggestion(question.sentence, question.sentence)
     evaluations = Evaluations(None if folder is None else folder / EVALUATIONS_FILE)
-    identity = key_of(model.scene.xml, plain(cfg), versions(), engine, *_arrays(recording))
+    # Fits and ratings are the same whatever they are compared for.
+    settings = plain(replace(cfg, method="best"))
+    identity = key_of(model.scene.xml, settings, versions(), engine, *_arrays(recording))
     scaled = lambda share, text: report(begin + (1 - begin) * share, text)  # noqa: E731
     hypotheses = _fitted(question, recording, cfg, engine, evaluations, identity, scaled)
     suggestion = _searched(question, hypotheses, recording, cfg, engine, evaluations, identity, scaled)

@@ -1,8 +1,12 @@
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from concent_warp.diagnosis.experiment.joint_motions import Drives, commanded_motion
-from concent_warp.diagnosis.suggestion.forecast import courses, forecasts
+from concent_warp.diagnosis.suggestion.forecast import Forecast, courses, forecasts
+from concent_warp.fit.effects.prediction import Prediction
 from tests.diagnosis.suggestion.carts import NOISE, friction_or_damping, one_speed, recorded_range
 
 RECORDING = one_speed()
@@ -63,3 +67,26 @@ def test_scores_grow_with_the_least_of_the_evidence():
     confused = found.evidence.copy()
     confused[0, 1] = 0.0
     assert type(found)(confused, found.separation, found.channels, found.count).score(1.0) < found.score(1.0)
+
+
+def test_what_courses_tell_is_not_simulated_again(monkeypatch):
+    hypotheses, motions = friction_or_damping(RECORDING, std=0.05), [motion(0.02), motion(0.05)]
+    moved = courses(hypotheses, RECORDED, motions, "mujoco")
+    candidates = [[(one, course)] for one, course in zip(motions, moved, strict=True) if course is not None]
+    counts, simulate = [], Prediction.courses
+    monkeypatch.setattr(
+        Prediction, "courses", lambda self, trials, *args: counts.append(len(trials)) or simulate(self, trials, *args)
+    )
+
+    def made(parts):
+        counts.clear()
+        found = forecasts(hypotheses, RECORDED, parts, "mujoco", window=2.0, step=0.1, starts=False)
+        return [one for one in found if one is not None], sum(counts)
+
+    short, count = made(candidates)
+    assert count == len(motions) * len(hypotheses)
+    whole, count = made([[(one, replace(course, readings=()))] for ((one, course),) in candidates])
+    assert count == 2 * len(motions) * len(hypotheses)
+    for a, b in zip(short, whole, strict=True):
+        assert a.evidence == pytest.approx(b.evidence, rel=1e-9)
+        assert Forecast.of(json.loads(json.dumps(a.plain()))).evidence == pytest.approx(a.evidence)

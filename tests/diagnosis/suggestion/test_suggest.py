@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.suggestion import search as search_module
 from concent_warp.diagnosis.suggestion import suggest as module
 from concent_warp.diagnosis.suggestion.cfg import MotionLimitsCfg, SuggestCfg
 from concent_warp.diagnosis.suggestion.evaluations import Evaluations
@@ -77,7 +78,7 @@ def test_an_interrupted_search_continues_with_the_same_result(found, tmp_path, m
     monkeypatch.setattr(Search, "_rated", stopped)
     with pytest.raises(KeyboardInterrupt):
         suggest(MODEL, RECORDING, QUICK, diagnosis=open_group(), state=tmp_path)
-    known = len(Evaluations(tmp_path / EVALUATIONS_FILE).known)
+    known = sum("careful" not in key for key in Evaluations(tmp_path / EVALUATIONS_FILE).known)
     assert known >= sum(calls)
     fresh = []
     monkeypatch.setattr(
@@ -88,4 +89,45 @@ def test_an_interrupted_search_continues_with_the_same_result(found, tmp_path, m
     monkeypatch.setattr(module, "fit_effects", lambda *_, **__: pytest.fail("fitted again"))
     again = suggest(MODEL, RECORDING, QUICK, diagnosis=open_group(), state=tmp_path)
     assert again.to_json() == found.to_json()
-    assert sum(fresh) == len(Evaluations(tmp_path / EVALUATIONS_FILE).known) - known
+    assert sum(fresh) == sum("careful" not in key for key in Evaluations(tmp_path / EVALUATIONS_FILE).known) - known
+
+
+def test_what_one_method_has_simulated_another_one_reads(found, tmp_path, monkeypatch):
+    assert suggest(MODEL, RECORDING, QUICK, diagnosis=open_group(), state=tmp_path).to_json() == found.to_json()
+    menu = replace(QUICK, method="menu")
+    alone = suggest(MODEL, RECORDING, menu, diagnosis=open_group())
+    rate = Search._rated
+
+    def known(self, candidates, *, starts):
+        assert not candidates
+        return rate(self, candidates, starts=starts)
+
+    monkeypatch.setattr(Search, "_rated", known)
+    monkeypatch.setattr(Search, "forecast", lambda *_, **__: pytest.fail("simulated again"))
+    assert suggest(MODEL, RECORDING, menu, diagnosis=open_group(), state=tmp_path).to_json() == alone.to_json()
+
+
+def test_nothing_is_searched_where_the_menu_separates_by_far(monkeypatch):
+    menu = suggest(MODEL, RECORDING, replace(QUICK, method="menu"), diagnosis=open_group())
+    margin = min(pair.evidence for pair in menu.pairs) / menu.needed
+    monkeypatch.setattr(Search, "optimised", lambda *_: pytest.fail("searched"))
+    enough = replace(QUICK, enough=0.5 * margin)
+    assert suggest(MODEL, RECORDING, enough, diagnosis=open_group()).to_json() == menu.to_json()
+
+
+def test_a_search_ends_where_it_finds_nothing_better(monkeypatch):
+    evolved, counts = Search._evolved, []
+
+    monkeypatch.setattr(Search, "_evolved", lambda self, family, *_: evolved(self, family, counts.append))
+    for gain, most in ((1e-6, 5), (1e3, 3)):
+        counts.clear()
+        cfg = replace(QUICK, method="optimised", evaluations=40, patience=2, min_gain=gain, enough=1e6)
+        suggest(MODEL, RECORDING, cfg, diagnosis=open_group())
+        assert len(counts) <= most
+    assert len(counts) == 3
+
+
+def test_motions_out_of_limits_are_not_forecast(monkeypatch):
+    monkeypatch.setattr(search_module, "forecasts", lambda *args, **_: pytest.fail("forecast") if args[2] else [])
+    still = replace(QUICK, method="menu", limits=MotionLimitsCfg(workspace=(5, 5, 5, 6, 6, 6)))
+    assert not suggest(MODEL, RECORDING, still, diagnosis=open_group()).found
