@@ -309,6 +309,10 @@ class DiagnoseCfg:
     quiet_min_gain: Share = 0.125
     """The same where the model leaves little more than noise in size [-]: errors of formulas, too, can be found there,
     in long recordings. Empirical."""
+    min_remainder_gain: Share = 0.5
+    """Share of what a model leaves beyond the noise that an effect must remove where the model leaves little,
+    `adequate_ratio` [-]: one that is missing explains most of it, one that takes up an error in a formula a part.
+    Empirical."""
     min_explained: Share = 0.2
     """Share of the discrepancy that the accepted effects must explain if something else is missing, or the model stays
     as given [-]: what explains less is rather an imitation. That of `SearchCfg.far_min_gain`."""

@@ -293,14 +293,13 @@ class Procedure:
         cfg, budget = context.cfg, context.budget
         left, lacked = discrepancies(last, given)
         added = any(f.accepted for f in record.findings)
-        unexplained = (
-            float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0)) if added or given.ratio > cfg.adequate_ratio else 0.0
-        )
+        share = float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0))
+        unexplained = share if added or given.ratio > cfg.adequate_ratio else 0.0
         adequate, form_error = context.explains(last, given, added=added), None
         if added and is_lacking(last, context.noise_factors, cfg) and context.is_form_error(last, given):
             form_error = unexplained
         unknown = None
-        if adequate and added:
+        if adequate and (added or record.part_refused):
             # What an effect explains with values that may be its null values needs no force of unknown form.
             tested = record.with_unestablished or fitted
             nodes = [given, *(tested[1:] or tested)]
@@ -320,6 +319,8 @@ class Procedure:
             unknown = replace(unknown, form_error=True)
         verdict: Verdict = "none_needed"
         lacking = unknown is not None and not unknown.form_error
+        if lacking and not added:
+            unexplained = share
         if not adequate or lacking:
             verdict = "none_of_these"
         elif len(fitted) > 1:

@@ -94,6 +94,8 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     assert f"multiple shooting over windows of {cfg.search.shooting_window:g} s" in PAGE
     assert f"shortened to their first {cfg.search.shooting_window:g} s" in PAGE
     assert f"the first fits leave more than {cfg.search.explained_ratio:g} x noise, all" in PAGE
+    assert cfg.min_remainder_gain == 0.5
+    assert "the best effect must remove half of what is left above the noise" in PAGE
     quiet = 1 / np.sqrt(1 - cfg.quiet_min_gain)
     assert f"than an effect must remove (8): beside effects, up to {quiet:.2f} x noise" in PAGE
     assert (cfg.search.decided_share, cfg.search.explained_min_gain) == (0.5, 0.3)

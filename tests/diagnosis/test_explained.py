@@ -10,7 +10,7 @@ import pytest
 
 from concent_warp.diagnosis import procedure as module
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
-from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.result import Diagnosis, UnknownForceFound
 from concent_warp.diagnosis.search import additions, context, revision
 from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
 from concent_warp.model import Model
@@ -69,6 +69,27 @@ def test_an_imitation_makes_the_verdict_none_of_these(monkeypatch):
     assert (found.verdict, found.form_error) == ("none_of_these", None)
     assert found.unexplained == pytest.approx(0.44 / 1.25)
     assert found.explains
+
+
+@pytest.mark.parametrize(
+    ("refused", "found", "verdict"),
+    [
+        (True, False, "none_of_these"),
+        (True, True, "none_needed"),
+        (True, None, "none_needed"),
+        (False, False, "none_needed"),
+    ],
+)
+def test_a_force_of_no_known_form_decides_where_no_effect_explains_enough_of_little(
+    monkeypatch, refused, found, verdict
+):
+    force = None if found is None else UnknownForceFound("a force", 0.2, 0.0025, 0.5, None, form_error=found)
+    monkeypatch.setattr(module, "unknown_force", lambda *_: force)
+    made, given = procedure(), node(1.2)
+    made.record.findings, made.record.part_refused = [finding("a", 0.1, accepted=False)], refused
+    concluded = made.conclude(given, [given], (), ())
+    assert concluded.verdict == verdict
+    assert (concluded.unexplained, concluded.explains) == ((1.0, False) if verdict == "none_of_these" else (0.0, True))
 
 
 def test_where_what_is_left_may_be_an_error_of_a_formula_one_more_effect_is_tried(monkeypatch):

@@ -22,7 +22,7 @@ from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
 from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.candidates.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.result import Detectable, Finding
-from concent_warp.diagnosis.search.adequacy import least_ratio
+from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
 from concent_warp.diagnosis.search.joint_fit import established_effects, joint_parameters
 from concent_warp.diagnosis.search.nominal_values import nominal_errors, nominal_sensitivities
@@ -112,6 +112,11 @@ class AdditionFinder:
             findings = [finding(c) for c in fitted]
         if explained:
             findings = self._established(base, fitted, findings)
+        whole = [f for f in findings if f.accepted and f.gain >= self._least_share(base)]
+        context.record.part_refused = not whole and any(f.accepted for f in findings)
+        if context.record.part_refused:
+            reason = "removes a part of what may be errors in formulas"
+            findings = [replace(f, accepted=False, reason=f.reason or reason) for f in findings]
         accepted = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not accepted:
             context.record.findings += sorted(findings, key=lambda f: -f.gain)
@@ -124,6 +129,13 @@ class AdditionFinder:
         if best.std is None:
             context.record.unprofiled[step] = base, best
         return best, smallest
+
+    def _least_share(self, base: FittedModel) -> float:
+        """Return the gain that the best effect must have where a model leaves little beyond the noise, 0 elsewhere."""
+        cfg, factors = self.context.cfg, self.context.noise_factors
+        if not is_adequate(base, factors, cfg):
+            return 0.0
+        return cfg.min_remainder_gain * max(1 - 1 / least_ratio(base, factors) ** 2, 0.0)
 
     def _least_promise(self, base: FittedModel) -> float:
         """Return the gain that an effect beside a provisional addition must promise, 0 where there is none.

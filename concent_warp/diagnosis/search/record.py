@@ -42,6 +42,8 @@ class SearchRecord:
     """Whether a flexible correction of the last addition, and no other effect, takes away what it left."""
     with_unestablished: list[FittedModel] = field(default_factory=list)
     """The fitted models with all effects, where some are removed that are not established."""
+    part_refused: bool = False
+    """Whether the last search for an effect found some, and none that explains enough of the little that was left."""
 
     def copy(self) -> SearchRecord:
         """Return a copy that does not change with this one."""

@@ -154,6 +154,34 @@ def test_a_residual_that_is_little_more_than_noise_is_searched_at_a_stricter_lev
     assert notes["asked"] == pytest.approx(0.999)
 
 
+@pytest.mark.parametrize(
+    ("ratio", "factor", "gains", "added"),
+    [
+        # 0.05 less over the model as refitted from its rivals
+        (1.2, 1.0, (0.20, 0.15), None),  # 0.306 is beyond the noise
+        (1.2, 1.0, (0.21, 0.15), "a"),
+        (1.24, 1.0, (0.22, 0.15), None),
+        (1.26, 1.0, (0.12, 0.1), "a"),  # more than a little
+        (1.44, 1.2, (0.20, 0.15), None),  # 1.2 x the largest noise
+        (1.0, 1.0, (0.18, 0.0), "a"),
+    ],
+)
+def test_an_effect_that_removes_a_smaller_part_of_little_beyond_the_noise_is_refused(
+    monkeypatch, ratio, factor, gains, added
+):
+    made = procedure()
+    made.context.noise_factors = {"angle": factor}
+    given = {"a": (gains[0], True), "b": (gains[1], True), "c": (gains[1], False)}
+    (best, sizes), _ = searched(monkeypatch, made, given, np.zeros(10), ratio)
+    assert (None if best is None else best.name) == added
+    assert made.record.part_refused is (added is None)
+    assert [f.accepted for f in made.record.findings] == [added is not None, False, False]
+    assert made.record.groups == ([] if added is None else [("a", "b")])
+    assert sizes == ("s1", "s3")
+    if added is None:
+        assert made.record.findings[0].reason == "removes a part of what may be errors in formulas"
+
+
 def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkeypatch):
     made = procedure()
     monkeypatch.setattr(find_addition, "linear_at_measured_states", lambda _base, _cfg: "shared")
