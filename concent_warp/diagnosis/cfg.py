@@ -330,6 +330,11 @@ class DiagnoseCfg:
     max_form_error: Share = 0.25
     """Share of the first discrepancy up to which such a remainder may be one that is more, if a flexible correction of
     the effects takes it away [-]: formulas are right to a half, a quarter in squares."""
+    small_form_error: Share = 0.01
+    """Share of the first discrepancy below which a remainder of up to `small_form_error_ratio` may be one, too [-]:
+    formulas are right to a tenth, a hundredth in squares, and data may be more precise than that."""
+    small_form_error_ratio: Positive = 5.0
+    """RMS residual over noise up to which it may [-]; beyond it too much is left to say what is missing. Empirical."""
     max_remainder: Share = 0.15
     """Share of such a remainder that a further effect may leave, if it is to be named all the same [-]: one that is
     missing explains nearly all of it, one that takes up an error in a formula a part. Empirical."""

@@ -73,6 +73,8 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     assert "up to three times (`--additions`)" in PAGE
     least, rest = 100 * cfg.unknown_force.min_share, 100 * cfg.max_remainder
     assert f"less than {least:.0f} % of the first discrepancy and at most {cfg.form_error_ratio:g} x noise" in PAGE
+    small, ratio = 100 * cfg.small_form_error, cfg.small_form_error_ratio
+    assert f"or less than {small:.0f} % and at most {ratio:g} x noise" in PAGE
     assert f"leaves at most {rest:.0f} % of that remainder" in PAGE
     assert cfg.search.reconsidered == 5
     assert "up to five that removed at least half as much" in PAGE

@@ -40,7 +40,11 @@ def test_the_least_ratio_is_the_residual_over_the_noise_as_large_as_it_may_be():
         (1.24, 3.0, 1.0, True, True),  # 7 %: an error in a formula
         (1.24, 2.5, 1.0, True, False),  # 10 %
         (1.9, 9.0, 1.0, True, True),
-        (2.01, 19.0, 1.0, True, False),
+        (2.01, 17.0, 1.0, True, False),
+        (2.01, 18.0, 1.0, True, True),  # 0.9 %
+        (4.9, 50.0, 1.0, True, True),
+        (4.9, 47.0, 1.0, True, False),  # 1.04 %
+        (5.1, 500.0, 1.0, True, False),
         (1.3, 1.7, 1.2, True, True),  # 1.08 x the largest noise
         (1.34, 1.7, 1.2, True, False),
     ],

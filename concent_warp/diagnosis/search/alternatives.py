@@ -67,13 +67,13 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
         for found, recorded in answers
         if not leaves_more(found[-1].errors, least.errors, cfg.search)
         or found[-1].ratio <= cfg.search.explained_ratio
-        or context.is_form_error(found[-1], first, recorded)
+        or context.is_form_error(found[-1], first, recorded, near_noise=True)
     ]
     equal.sort(key=lambda answer: -plausibility(answer[0][-1]))
     best, context.record = equal[0]
-    formulas = context.is_form_error(best[-1], first)
+    formulas = context.is_form_error(best[-1], first, near_noise=True)
     for other, of_other in equal[1:]:
-        errors = formulas and context.is_form_error(other[-1], first, of_other)
+        errors = formulas and context.is_form_error(other[-1], first, of_other, near_noise=True)
         if log_odds(other[-1], best[-1], first if errors else None, cfg) > -2 * np.log(cfg.search.max_odds):
             _add_to_group(context.record, of_other, other[-1])
     return best

@@ -60,19 +60,26 @@ class SearchContext:
         near = one.ratio <= self.cfg.form_error_ratio
         return self.cfg.min_gain if near else max(self.cfg.min_gain, self.cfg.search.far_min_gain)
 
-    def is_form_error(self, one: FittedModel, first: FittedModel, record: SearchRecord | None = None) -> bool:
+    def is_form_error(
+        self, one: FittedModel, first: FittedModel, record: SearchRecord | None = None, *, near_noise: bool = False
+    ) -> bool:
         """Return whether a model with added effects leaves no more than errors in their formulas.
 
-        Little is then left beside the discrepancy of the first model, and little beside the noise.
+        Little is then left beside the discrepancy of the first model, and little beside the noise; less beside the
+        discrepancy where it is more beside the noise.
 
         Args:
             one: The fitted model.
             first: The model as given.
             record: What the search that led to the model has found; by default that of this context.
+            near_noise: Whether no more than `DiagnoseCfg.form_error_ratio` beside the noise counts in any case.
         """
         left, lacked = discrepancies(one, first)
         share = self.cfg.max_form_error if (record or self.record).form_corrected else self.cfg.unknown_force.min_share
-        return left < share * lacked and one.ratio <= self.cfg.form_error_ratio
+        if one.ratio > self.cfg.form_error_ratio:
+            small = not near_noise and one.ratio <= self.cfg.small_form_error_ratio
+            share = self.cfg.small_form_error if small else 0.0
+        return left < share * lacked
 
     def explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
         """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.

@@ -101,8 +101,9 @@ class Revision:
             self.reduced = reduced
             reduced = [self._with_nominal_instead(one, last) for one in reduced]
             shares = [_gain_over(one, last) for one in reduced]
-            least = int(np.argmin(shares))
-            if shares[least] >= context.cfg.min_gain:
+            needed = [self._least_share(one, fitted[0]) for one in reduced]
+            least = int(np.argmin(np.subtract(shares, needed)))
+            if shares[least] >= needed[least]:
                 break
             step = steps.pop(least)
             fitted = [*fitted, reduced[least]]
@@ -110,6 +111,18 @@ class Revision:
             record.refuse(lambda f, step=step: f.step == step, "made superfluous by effects added later")
         record.groups = [group for group in record.groups if group]
         return fitted
+
+    def _least_share(self, reduced: FittedModel, first: FittedModel) -> float:
+        """Return the share of a model's error that an effect must explain which it lacks.
+
+        Where other effects leave no more than errors in their formulas may be, it is that of a further effect beside
+        them, see `DiagnoseCfg.max_remainder`.
+        """
+        context, cfg = self.context, self.context.cfg
+        others = len(reduced.model.effects) > len(first.model.effects)
+        if not others or reduced.ratio <= cfg.form_error_ratio or not context.is_form_error(reduced, first):
+            return cfg.min_gain
+        return max(cfg.min_gain, (1 - cfg.max_remainder) * max(1 - 1 / reduced.ratio**2, 0.0))
 
     def _with_nominal_instead(self, reduced: FittedModel, last: FittedModel) -> FittedModel:
         """Return a model without one of the last model's effects, with nominal values within their tolerance if better.

@@ -313,6 +313,22 @@ def test_an_effect_that_removes_the_least_gain_stays(monkeypatch):
     assert alone.revision.remove_superfluous(nodes) is nodes
 
 
+def test_an_effect_that_takes_up_a_part_of_what_may_be_an_error_in_formulas_is_superfluous(monkeypatch):
+    for first, ratio, errors, kept in (
+        (100.0, 4.0, 100 / 0.22, False),  # 78 % of 0.15 % of the discrepancy, 80 % are needed
+        (100.0, 4.0, 100 / 0.18, True),
+        (100.0, 6.0, 150.0, True),  # too much beside the noise for such an error
+        (30.0, 4.0, 150.0, True),  # too much beside the discrepancy
+        (100.0, 1.9, 150.0, True),  # so little beside the noise that additions have been judged by it
+    ):
+        made, reduced = procedure(), node(ratio, errors, 1)
+        made.record.groups, made.record.hypotheses = [("a",), ("b",)], [{}, {}]
+        monkeypatch.setattr(revision, "refit_without_effect", lambda *_, reduced=reduced: reduced)
+        monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+        after = made.revision.remove_superfluous([node(first), node(2), node(1.1, 100.0, 2)])
+        assert (len(after) == 3) == kept
+
+
 def test_an_effect_is_superfluous_where_nominal_values_explain_as_much(monkeypatch):
     for errors, found, dropped in ((150.0, 104.0, True), (150.0, 106.0, False), (104.0, None, True)):
         made, last = procedure(), node(1.1, 100.0, 2)
