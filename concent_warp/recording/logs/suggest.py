@@ -16,7 +16,7 @@ from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.logs.suggest_vectors import VectorChoice, vector_choices
-from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
+from concent_warp.recording.logs.targets import Target, body_sensors, named_parts, targets_of
 from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
 from concent_warp.scene.scene import Scene
 
@@ -59,11 +59,12 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
         RecordingError: The log cannot be read.
         SceneError: The scene cannot be read.
     """
-    first = log_sources(source)[0]
+    m = scene_of(model).model
+    parts = named_parts(m)
+    first = log_sources(source, parts)[0]
     if first.exists() and log_kind(first) == "bop":
         raise RecordingError("a scene of a BOP data set needs no map", where=first, fix="import it with -o demo.h5")
-    log = open_log(first)
-    m = scene_of(model).model
+    log = open_log(first, parts)
     found = log.episode(log.numbers[0] if episode is None else episode)
     actuators, sensors = targets_of(m)
     commands = [one for one in found.signals.values() if one.command]
@@ -88,6 +89,8 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
         used |= {name for one in vectors for name in one.sources}
         lines += _vectors(several, vectors)
     lines += _images(found)
+    if any(one.frames for one in found.signals.values()):
+        lines += ["# [clock]  # the table has numbers of frames, and no times", '# "*" = { rate = ? }  # in Hz', ""]
     if left := [name for name in found.signals if name not in used]:
         lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
     return "\n".join(lines).rstrip() + "\n"
