@@ -219,7 +219,7 @@ def _weights(time: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray, np.nda
     """Return the weights of three consecutive first differences in a third one of unit variance, each (T - 3 lag,).
 
     The third divided difference of readings r at times t is the sum of r_i / prod(t_i - t_j), j other than i: 0 for
-    every parabola. Weights have norm 1, so that noise of unit variance leaves unit variance; even steps divide by sqrt(20).
+    every parabola. Weights have norm 1, so that noise of unit variance leaves unit variance.
     """
     count = len(time) - 3 * lag
     t = np.stack([time[k * lag : k * lag + count] for k in range(4)]) / max(float(np.ptp(time)), 1e-300)
