@@ -355,6 +355,8 @@ class ObservedRecording:
     """Standard deviation of a component of each channel that counts."""
     cfg: ObservationCfg = field(default_factory=ObservationCfg)
     """Settings."""
+    _measured: dict[int, tuple[Demonstration, StateEstimator | None]] = field(default_factory=dict, repr=False)
+    """Estimated motions so far, by the identity of the demonstration."""
 
     def state(self, d: Demonstration, time: float) -> PartialState:
         """Return the state of a demonstration at a time [s], as recorded or measured, else of the reference pose."""
@@ -372,10 +374,13 @@ class ObservedRecording:
 
     def measured(self, d: Demonstration) -> StateEstimator | None:
         """Return the estimated motion of a demonstration, None where the pose of a body or joint was not measured."""
-        try:
-            return StateEstimator.of(self.model, d)
-        except RecordingError:
-            return None
+        if id(d) not in self._measured:
+            try:
+                found = StateEstimator.of(self.model, d)
+            except RecordingError:
+                found = None
+            self._measured[id(d)] = (d, found)
+        return self._measured[id(d)][1]
 
     def window(self, number: int, start: float, end: float) -> Window | None:
         """Return a window; None where nothing was measured in it."""
