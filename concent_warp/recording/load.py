@@ -9,6 +9,7 @@ from concent_warp.recording.formats.bam import read_bam
 from concent_warp.recording.formats.contactnets import read_contactnets
 from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.formats.hdf5 import read_hdf5
+from concent_warp.recording.held import from_release
 from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
@@ -32,7 +33,7 @@ def load_recording(path: Path | str) -> Recording:
     what is in it: ``.pt`` files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders, or else ``.json`` files.
     Angles of joints that begin anew after each turn are continued over the jumps, single positions far off those beside
     them are taken as missing, and times of a log that begins later than its clock are counted from its first sample,
-    each with a warning.
+    those of a machine without drives from when it was let go, each with a warning.
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
@@ -43,7 +44,7 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    recording = without_spikes(unwound(_read(Path(path))))
+    recording = from_release(without_spikes(unwound(_read(Path(path)))))
     warn_of_still_bodies(recording)
     return recording
 
