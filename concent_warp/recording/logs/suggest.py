@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,10 @@ ROOM = 20.0
 """Distance of a body from the origin above which positions are guessed to be in millimetres [m]."""
 MAX_DEGREES = 720.0
 """Largest value that is guessed to be an angle in degrees [deg]."""
+
+
+UNCALLED = "no name says command"
+"""Why torques that are taken for commands of motors may be measured ones."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,13 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     commands = [one for one in found.signals.values() if one.command]
     readings = [one for one in found.signals.values() if not one.command]
     lines = [f"# Map from {first.name} ({log.kind}): check every line, above all units and signs.", ""]
-    chosen = _matched(list(actuators.values()), commands)
+    efforts = [one for one in readings if _quantity(one.name) == "effort"]
+    if not commands and len(efforts) == len(actuators) and not any(one.position for one in actuators.values()):
+        readings = [one for one in readings if one not in efforts]
+        named = _matched(list(actuators.values()), efforts)
+        chosen = [replace(one, guess=", ".join(filter(None, (one.guess, UNCALLED)))) for one in named]
+    else:
+        chosen = _matched(list(actuators.values()), commands)
     lines += _section("action", list(actuators.values()), chosen)
     joints = [one for one in sensors.values() if one.size == 1]
     measured = _matched([one for one in joints if one.position], _of(readings, "position"))
@@ -107,7 +117,7 @@ def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
 
 def _quantity(name: str) -> str:
     """Return the quantity that a name says, position if it says none."""
-    words = words_of(name)
+    words = [word.rstrip("0123456789") for word in words_of(name)]
     said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
     return said[-1] if said else "position"
 

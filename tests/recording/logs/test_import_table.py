@@ -362,3 +362,17 @@ def test_counts_of_an_encoder_are_told_from_degrees(tmp_path, limits):
     (tmp_path / "map.toml").write_text(f'{entry}unit = "turn"\nscale = {1 / 16384}\n')
     (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
     np.testing.assert_allclose(d.measured["angle"].value[:, 0], np.sin(3 * TIME), atol=1e-3)
+
+
+def test_torques_are_suggested_for_motors_where_nothing_is_called_a_command(tmp_path):
+    model = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+    <body><joint name="b" axis="0 1 0"/><geom size="0.1"/></body></body></worldbody><actuator>{}</actuator>
+    <sensor><jointpos name="a" joint="a"/><jointpos name="b" joint="b"/></sensor></mujoco>"""
+    (tmp_path / "robot.xml").write_text(model.format('<motor name="a" joint="a"/><motor name="b" joint="b"/>'))
+    (tmp_path / "a.csv").write_text("t,a (deg),b (deg),torque1 (Nm),torque2 (Nm)\n0,1,2,3,4\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert '[action.a]  # guess: by order, no name says command\nsource = "torque1 (Nm)"\n' in text
+    assert '[measured.b]\nsource = "b (deg)"\nunit = "deg"\n' in text
+    servos = '<position name="a" joint="a" kp="1"/><position name="b" joint="b" kp="1"/>'
+    (tmp_path / "robot.xml").write_text(model.format(servos))
+    assert "# [action.a]  # no channel found" in suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
