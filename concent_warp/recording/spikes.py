@@ -14,7 +14,7 @@ from typing import Annotated
 import mujoco
 import numpy as np
 
-from concent_warp.checks import MAX_COUNT, Bounds, Positive, Share
+from concent_warp.checks import MAX_COUNT, Bounds, Count, Positive, Share
 from concent_warp.errors import printable
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -36,6 +36,8 @@ class SpikeCfg:
     the corner of a path, where a body rebounds or stops."""
     max_share: Share = 0.05
     """Largest share of a channel's readings that may be spikes [-]: what is more frequent is no accident."""
+    max_group: Count = 2
+    """Most spikes near one another [-]."""
     min_readings: Annotated[int, Bounds(8, MAX_COUNT)] = 20
     """Fewest readings of a channel that is looked at."""
     rounding: float = 1e-9
@@ -116,24 +118,46 @@ def spikes(time: np.ndarray, value: np.ndarray, cfg: SpikeCfg | None = None) -> 
         if ratio[start] <= cfg.min_ratio:
             break
         # Of neighbours, which a spike throws off too, it is the one that is left out first.
-        place = int(np.searchsorted(left, rows[start]))
-        if place >= len(left) or left[place] != rows[start]:
-            continue
-        around = left[max(place - 2 * BESIDE - 2, 0) : place + 2 * BESIDE + 3]
-        now = _off(time[around], value[around])
-        k = int(np.searchsorted(around, rows[start]))
-        size = float((now[k] / usual).max())
-        others = np.delete(around, k)
-        beside = (_off(time[others], value[others]) / usual).max(axis=1)[max(k - BESIDE, 0) : k + BESIDE]
-        if size > cfg.min_ratio and (beside <= cfg.max_beside * size).all():
-            found.append(rows[start])
-            left = np.delete(left, place)
+        if rows[start] in left:
+            group = _group(rows[start], left, time, value / usual, cfg)
+            found += group
+            left = left[~np.isin(left, group)]
     return np.array(sorted(found)) if len(found) <= most else none
 
 
 def _median(value: np.ndarray) -> float:
     """Return the median of values, shape (n,); infinity of none."""
     return float(np.median(value)) if len(value) else np.inf
+
+
+def _group(row: int, left: np.ndarray, time: np.ndarray, value: np.ndarray, cfg: SpikeCfg) -> list[int]:
+    """Return the spikes near a row, with it; none where those beside them do not lie on a smooth path without them.
+
+    Args:
+        row: The row.
+        left: Rows that are no spikes so far, ascending, shape (n,).
+        time: Clock readings [s], shape (T,).
+        value: Positions in units of what they usually are off by, shape (T, dim).
+        cfg: Thresholds.
+    """
+    reach = 3 * BESIDE + 2
+    place = int(np.searchsorted(left, row))
+    around, group = left[max(place - reach, 0) : place + reach + 1], [row]
+    while len(group) <= cfg.max_group:
+        others = around[~np.isin(around, group)]
+        sizes = []
+        for one in group:
+            one_of = np.sort(np.append(others, one))
+            sizes.append(float(_off(time[one_of], value[one_of])[np.searchsorted(one_of, one)].max()))
+        off = _off(time[others], value[others]).max(axis=1)
+        places = np.searchsorted(others, group)
+        beside = np.unique([k for p in places for k in range(p - BESIDE, p + BESIDE) if 0 <= k < len(others)])
+        if min(sizes) > cfg.min_ratio and off[beside].max() <= cfg.max_beside * min(sizes):
+            return group
+        if off[beside].max() <= cfg.min_ratio:
+            break
+        group.append(int(others[np.argmax(off)]))  # which may be the other spike that throws those beside off
+    return []
 
 
 def _off(time: np.ndarray, value: np.ndarray) -> np.ndarray:

@@ -31,6 +31,9 @@ def test_single_readings_far_from_those_beside_them_are_found():
     gap = with_spikes()
     gap[200] = gap[202:215] = np.nan
     np.testing.assert_array_equal(spikes(TIME, gap), ROWS)
+    near = with_spikes()
+    near[ROWS + 3, 0] -= 0.06
+    np.testing.assert_array_equal(spikes(TIME, near), np.sort([*ROWS, *ROWS + 3]))
 
 
 @pytest.mark.parametrize("rebound", [-1.0, 0.0, 0.5, 0.95])
