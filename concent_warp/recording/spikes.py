@@ -113,16 +113,17 @@ def spikes(time: np.ndarray, value: np.ndarray, cfg: SpikeCfg | None = None) -> 
     least = cfg.rounding * np.abs(value[rows]).max(axis=0)  # readings in steps often agree exactly
     usual = np.array([_median(one[one > floor]) for one, floor in zip(off.T, least, strict=True)]) / 0.67449
     ratio = (off / usual).max(axis=1)
-    left, found = rows, []
+    left = rows
+    found: list[int] = []
     for start in np.argsort(-ratio)[: 3 * most + 3]:
         if ratio[start] <= cfg.min_ratio:
             break
         # Of neighbours, which a spike throws off too, it is the one that is left out first.
         if rows[start] in left:
-            group = _group(rows[start], left, time, value / usual, cfg)
+            group = _group(int(rows[start]), left, time, value / usual, cfg)
             found += group
             left = left[~np.isin(left, group)]
-    return np.array(sorted(found)) if len(found) <= most else none
+    return np.array(sorted(found), dtype=int) if len(found) <= most else none
 
 
 def _median(value: np.ndarray) -> float:
