@@ -40,6 +40,10 @@ WORDS: dict[Source, str] = {
 """The sources in words."""
 
 
+EVEN = 1e-6
+"""Deviation of the weights of differences from those for even steps that is rounding [-]."""
+
+
 @dataclass(frozen=True)
 class NoiseCfg:
     """Settings of the estimation of noise."""
@@ -207,19 +211,19 @@ def _difference_std(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, 
                 if kind == "orientation"
                 else np.asarray(piece[lag:] - piece[:-lag])
             )
-            steps = (first[: -2 * lag], first[lag:-lag], first[2 * lag :])
-            third.append(sum(w[:, None] * step for w, step in zip(_weights(time, lag), steps, strict=True)))
+            before, middle, after = _weights(time, lag)
+            third.append(after * first[2 * lag :] + middle * first[lag:-lag] + before * first[: -2 * lag])
     if not third:
         return np.nan
     spread = np.median(np.abs(np.concatenate(third)), axis=0) / 0.67449
-    return float(np.sqrt(np.mean(spread**2)))
+    return float(np.sqrt(np.mean(spread**2) / 20))
 
 
 def _weights(time: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the weights of three consecutive first differences in a third one of unit variance, each (T - 3 lag,).
+    """Return the weights of three consecutive first differences in a third one, each (T - 3 lag, 1).
 
     The third divided difference of readings r at times t is the sum of r_i / prod(t_i - t_j), j other than i: 0 for
-    every parabola. Weights have norm 1, so that noise of unit variance leaves unit variance.
+    every parabola. Weights of readings have the norm sqrt(20) of those for even steps, which are 1, -2, 1 here.
     """
     count = len(time) - 3 * lag
     t = np.stack([time[k * lag : k * lag + count] for k in range(4)]) / max(float(np.ptp(time)), 1e-300)
@@ -227,8 +231,10 @@ def _weights(time: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray, np.nda
     apart[np.arange(4), np.arange(4)] = 1.0
     size = np.abs(apart).prod(axis=1)
     w = np.array([-1.0, 1.0, -1.0, 1.0])[:, None] * size.min(axis=0) / size
-    w = w / np.sqrt((w**2).sum(axis=0))
-    return -w[0], w[2] + w[3], w[3]
+    w = w * np.sqrt(20 / (w**2).sum(axis=0))
+    steps, even = np.stack([-w[0], w[2] + w[3], w[3]]), np.array([[1.0], [-2.0], [1.0]])
+    steps = np.where(np.abs(steps - even) < EVEN, even, steps)  # without the rounding of even times
+    return steps[0][:, None], steps[1][:, None], steps[2][:, None]
 
 
 def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float, cfg: NoiseCfg) -> tuple[float, int] | None:
