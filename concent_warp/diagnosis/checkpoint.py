@@ -73,7 +73,8 @@ class CheckpointedRunner(TaskRunner):
                 yield known[i]
                 continue
             result = next(fresh)
-            if result is not None:
+            # A fitted model has all of its windows, and is quickly found anew.
+            if result is not None and not isinstance(result, FittedModel):
                 _save(path, result)
             yield result
 

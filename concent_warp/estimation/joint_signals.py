@@ -1,4 +1,4 @@
-"""Measured motion of hinges and slides: by their own sensors, and by tendons, equalities and loops that couple them."""
+"""Measured motion of hinges and slides: by their own sensors, by tendons, equalities and loops, and by markers."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.closed_loops import ClosedLoopCfg, close_loops
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
+from concent_warp.estimation.marked_joints import marked_joints
 from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sample_values_and_rates
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.recording.recording import Channel
@@ -152,6 +153,12 @@ def coupled_joints(
         found = joined()
         loose = _loose(found.coefficients, min_singular)
     if loose.any():
+        for k, signal in _told_by_poses(m, demonstration, smoother, found, loose).items():
+            equations.append(np.eye(len(joints))[k])
+            readings.append(signal)
+        found = joined()
+        loose = _loose(found.coefficients, min_singular)
+    if loose.any():
         raise RecordingError(
             "a window cannot start where joints were not measured",
             where=demonstration.name,
@@ -195,6 +202,30 @@ def _closed_by_loops(
     found: dict[int, Signal] = {}
     for k in np.flatnonzero(loose):
         signal = smoother.signal(Channel(time, closed[:, [known.qpos[k]]]), None, "joint")
+        if signal is not None:
+            found[int(k)] = signal
+    return found
+
+
+def _told_by_poses(
+    m: mujoco.MjModel, demonstration: Demonstration, smoother: SmootherCfg, known: CoupledJoints, loose: np.ndarray
+) -> dict[int, Signal]:
+    """Return the positions of joints that poses of bodies on them tell, by their index among those of the equations.
+
+    Args:
+        m: The compiled scene.
+        demonstration: What was measured.
+        smoother: How positions are smoothed.
+        known: All joints, of which some are determined.
+        loose: Those that are not, shape (J,) bool.
+    """
+    told = marked_joints(m, demonstration, known.dof[loose], known.dof[~loose].tolist())
+    if told is None:
+        return {}
+    time, value = told
+    found: dict[int, Signal] = {}
+    for column, k in enumerate(np.flatnonzero(loose)):
+        signal = smoother.signal(Channel(time, value[:, [column]]), None, "joint")
         if signal is not None:
             found[int(k)] = signal
     return found

@@ -6,7 +6,8 @@ its variance at every lag (of first differences: von Neumann, "Distribution of t
 difference to the variance", Ann. Math. Stat. 12, 1941), that of a smooth motion grows with the sixth power of the lag,
 and that of noise which is correlated over some samples grows slowly until the lag exceeds its correlation time. The
 noise is read off at the largest lag before the motion takes over; what is left open between it and the motion is the
-interval. Neither estimate falls below what the resolution of the readings leaves, a step / sqrt(12).
+interval. Differences are divided by those of the times, so that uneven steps, which clocks of robots have, make no
+noise of a motion. Neither estimate falls below what the resolution of the readings leaves, a step / sqrt(12).
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ WORDS: dict[Source, str] = {
     "unknown": "not known",
 }
 """The sources in words."""
+
+
+EVEN = 1e-6
+"""Deviation of the weights of differences from those for even steps that is rounding [-]."""
 
 
 @dataclass(frozen=True)
@@ -119,12 +124,13 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
         return Noise(float(np.sqrt(np.mean(np.square(stated)))), "stated")
     if kind != "orientation" and any(map(_is_partial, channels)):
         return _noise_of_components(channels, kind, cfg)
-    pieces = [piece for c in channels for piece in _finite_pieces(c.value)]
+    timed = [piece for c in channels for piece in _finite_pieces(c)]
+    pieces = [piece for _, piece in timed]
     if sum(len(piece) for piece in pieces) < cfg.min_readings:
         return Noise(np.nan, "unknown")
     floor = 0.0 if kind == "orientation" else _resolution(pieces) / np.sqrt(12)
-    found = _noise_in_differences(pieces, kind, cfg)
-    fast = _difference_std(pieces, kind, 1)
+    found = _noise_in_differences(timed, kind, cfg)
+    fast = _difference_std(timed, kind, 1)
     if (rest := _rest_std(pieces, kind, max(fast, floor), cfg)) is not None:
         scatter, freedom = rest
         std, error = max(scatter, fast), 2 / np.sqrt(2 * freedom)
@@ -159,22 +165,23 @@ def _noise_of_components(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg)
     return Noise(std, largest.source, low, high)
 
 
-def _finite_pieces(value: np.ndarray) -> list[np.ndarray]:
-    """Return the stretches of `value` (T, dim) without missing readings, each (n, dim)."""
-    value = np.asarray(value, dtype=float).reshape(len(value), -1)
+def _finite_pieces(channel: Channel) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return times (n,) and values (n, dim) of the stretches of a channel without missing readings."""
+    value = np.asarray(channel.value, dtype=float).reshape(len(channel.value), -1)
     valid = np.asarray(np.isfinite(value).all(axis=1))
     edges = np.flatnonzero(np.diff(valid)) + 1
     parts = np.split(np.arange(len(value)), edges)
-    return [value[rows] for rows in parts if len(rows) and bool(valid[rows].all())]
+    return [(channel.time[rows], value[rows]) for rows in parts if len(rows) and bool(valid[rows].all())]
 
 
-def _noise_in_differences(pieces: Sequence[np.ndarray], kind: Kind, cfg: NoiseCfg) -> Noise:
+def _noise_in_differences(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, cfg: NoiseCfg) -> Noise:
     """Return the noise per component seen in third differences over several lags.
 
     Of two lags h and 2 h, noise s and smooth motion m h^3 leave s^2 = (64 v(h) - v(2 h)) / 63 of the variances v.
     """
+    pieces = [piece for _, piece in timed]
     lags = [h for h in cfg.lags if sum(max(len(piece) - 3 * h, 0) for piece in pieces) >= cfg.min_readings]
-    values = [_difference_std(pieces, kind, h) for h in lags or cfg.lags[:1]]
+    values = [_difference_std(timed, kind, h) for h in lags or cfg.lags[:1]]
     std, low, high = values[0], 0.0, values[0]
     most = cfg.max_share * _spread(pieces, kind)
     for k, (near, far) in enumerate(pairwise(values)):
@@ -191,25 +198,43 @@ def _spread(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     return float(np.sqrt(np.mean(centred**2)))
 
 
-def _difference_std(pieces: Sequence[np.ndarray], kind: Kind, lag: int) -> float:
+def _difference_std(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, lag: int) -> float:
     """Return the noise per component seen in third differences, by their median size, so that impacts count little.
 
-    Third differences of independent noise have the variance 1 + 9 + 9 + 1 = 20. Of orientations the first difference
-    is the rotation vector from one reading to a later one.
+    Of orientations the first difference is the rotation vector from one reading to a later one.
     """
     third = []
-    for piece in pieces:
+    for time, piece in timed:
         if len(piece) > 3 * lag:
             first = (
                 rotation_vectors(piece[:-lag], piece[lag:])
                 if kind == "orientation"
                 else np.asarray(piece[lag:] - piece[:-lag])
             )
-            third.append(first[2 * lag :] - 2 * first[lag:-lag] + first[: -2 * lag])
+            before, middle, after = _weights(time, lag)
+            third.append(after * first[2 * lag :] + middle * first[lag:-lag] + before * first[: -2 * lag])
     if not third:
         return np.nan
     spread = np.median(np.abs(np.concatenate(third)), axis=0) / 0.67449
     return float(np.sqrt(np.mean(spread**2) / 20))
+
+
+def _weights(time: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the weights of three consecutive first differences in a third one, each (T - 3 lag, 1).
+
+    The third divided difference of readings r at times t is the sum of r_i / prod(t_i - t_j), j other than i: 0 for
+    every parabola. Weights of readings have the norm sqrt(20) of those for even steps, which are 1, -2, 1 here.
+    """
+    count = len(time) - 3 * lag
+    t = np.stack([time[k * lag : k * lag + count] for k in range(4)]) / max(float(np.ptp(time)), 1e-300)
+    apart = t[:, None] - t[None]
+    apart[np.arange(4), np.arange(4)] = 1.0
+    size = np.abs(apart).prod(axis=1)
+    w = np.array([-1.0, 1.0, -1.0, 1.0])[:, None] * size.min(axis=0) / size
+    w = w * np.sqrt(20 / (w**2).sum(axis=0))
+    steps, even = np.stack([-w[0], w[2] + w[3], w[3]]), np.array([[1.0], [-2.0], [1.0]])
+    steps = np.where(np.abs(steps - even) < EVEN, even, steps)  # without the rounding of even times
+    return steps[0][:, None], steps[1][:, None], steps[2][:, None]
 
 
 def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float, cfg: NoiseCfg) -> tuple[float, int] | None:

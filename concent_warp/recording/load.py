@@ -9,9 +9,11 @@ from concent_warp.recording.formats.bam import read_bam
 from concent_warp.recording.formats.contactnets import read_contactnets
 from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.formats.hdf5 import read_hdf5
+from concent_warp.recording.held import from_release
 from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.spikes import without_spikes
 from concent_warp.recording.still_bodies import warn_of_still_bodies
 from concent_warp.recording.unwind import unwound
 
@@ -29,8 +31,9 @@ def load_recording(path: Path | str) -> Recording:
 
     An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``, a BAM log by ``.json``; a folder by
     what is in it: ``.pt`` files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders, or else ``.json`` files.
-    Angles of joints that begin anew after each turn are continued over the jumps, and times of a log that begins later
-    than its clock are counted from its first sample, each with a warning.
+    Angles of joints that begin anew after each turn are continued over the jumps, single positions far off those beside
+    them are taken as missing, and times of a log that begins later than its clock are counted from its first sample,
+    those of a machine without drives from when it was let go, each with a warning.
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
@@ -41,7 +44,7 @@ def load_recording(path: Path | str) -> Recording:
         >>> round(recording[0].duration)  # s
         4
     """
-    recording = unwound(_read(Path(path)))
+    recording = from_release(without_spikes(unwound(_read(Path(path)))))
     warn_of_still_bodies(recording)
     return recording
 

@@ -31,7 +31,7 @@ def counted_from_first_sample(recording: Recording, cfg: ClockCheckCfg | None = 
         first = _first(d)
         if first > cfg.short_gap and d.qpos is None and d.qvel is None:
             moved[d.name] = first
-            d = _earlier(d, first)
+            d = earlier(d, first)
         demonstrations.append(d)
     if not moved:
         return recording
@@ -53,7 +53,7 @@ def _streams(d: Demonstration) -> list[Any]:
     return [*d.action.values(), *d.measured.values(), *d.points.values(), *d.image.values(), *policy]
 
 
-def _earlier(d: Demonstration, by: float) -> Demonstration:
+def earlier(d: Demonstration, by: float) -> Demonstration:
     """Return a demonstration with all times earlier by some seconds."""
     kinds = {
         kind: {name: replace(stream, time=stream.time - by) for name, stream in getattr(d, kind).items()}

@@ -127,7 +127,7 @@ class _Residuals:
             parts.append(np.array([lengths[m.sensor_objid[row]] - length]))
         for frame, value in self._readings.place:
             place = d.xpos[frame.body] + d.xmat[frame.body].reshape(3, 3) @ frame.offset
-            parts.append(np.nan_to_num(place - frame.place_in_world(value)))
+            parts.append(np.nan_to_num(frame.base_turn.inv().apply(place - frame.base_origin) - value))
         for frame, value in self._readings.turn:
             turn = Rotation.from_quat(d.xquat[frame.body], scalar_first=True)
             parts.append((frame.body_in_world(value).inv() * turn).as_rotvec())

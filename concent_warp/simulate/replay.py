@@ -117,13 +117,14 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
             continue
         joint = model.body_jntadr[frame.body]
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-            if len(first):
-                (others.place if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS else others.turn).append((frame, first[0]))
+            if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
+                others.place.append((frame, _first_of_each(channel.value)))
+            elif len(first):
+                others.turn.append((frame, first[0]))
             continue
         address = int(model.jnt_qposadr[joint])
         if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
-            value = [channel.value[k, i][0] if (k := known[:, i]).any() else np.nan for i in range(3)]
-            framed.append((address, frame, np.array(value)))
+            framed.append((address, frame, _first_of_each(channel.value)))
         elif kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT and len(first):
             qpos[address + 3 : address + 7] = frame.body_in_world(first[0]).as_quat(scalar_first=True)
     # Of several frames on a body, its own says where it is.
@@ -133,6 +134,12 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
         seen = np.isfinite(place)
         qpos[address : address + 3][seen] = place[seen]
     return with_unmeasured_joints(model, qpos, joints, others), qvel
+
+
+def _first_of_each(value: np.ndarray) -> np.ndarray:
+    """Return the first reading of each component of values (T, n), shape (n,), NaN where there is none."""
+    known = np.isfinite(value)
+    return np.array([value[k, i][0] if (k := known[:, i]).any() else np.nan for i in range(value.shape[1])])
 
 
 def replay(

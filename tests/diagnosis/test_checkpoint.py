@@ -4,13 +4,17 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import tasks as task_module
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
 from concent_warp.diagnosis.candidates.candidate import ScreenedCandidate
+from concent_warp.diagnosis.candidates.growing_windows import baseline_of_first_parts
 from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
-from concent_warp.diagnosis.checkpoint import _load, _save
+from concent_warp.diagnosis.checkpoint import _load, _save, checkpointed_runner
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search import context
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.observe import observe
 from tests.diagnosis.same_results import assert_same
 from tests.scenes.swinging import drawing, swung
 
@@ -109,6 +113,18 @@ def test_saved_results_are_restored_unchanged(recording, tmp_path):
     assert found.start.tolist() == [1.0, np.inf]
     assert _load(tmp_path / "b.npz", drawing(recording)) is None
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_a_model_over_the_first_parts_of_windows_is_found_anew(recording, tmp_path):
+    model = drawing(recording)
+    windows = observe(model, recording)
+    base = fit_baseline(model, windows, cut_blocks(windows))
+    runner = checkpointed_runner(model, recording, CFG, lambda *_: None, "mujoco", tmp_path)
+    for _ in range(2):
+        (near,) = runner.results(baseline_of_first_parts, [(base, 0.3)])
+        assert near is not None
+        assert near.windows[0].end == pytest.approx(near.windows[0].start + 0.3)
+    assert not list(tmp_path.glob("*.npz"))
 
 
 def test_a_folder_that_cannot_be_made_is_an_error(recording, tmp_path):

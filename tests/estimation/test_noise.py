@@ -166,3 +166,20 @@ def test_lags_are_settings():
     near = channel_noise(Channel(TIME, value), "position", NoiseCfg(lags=(1, 2)))
     far = channel_noise(Channel(TIME, value), "position")
     assert near.std < 0.75 * STD < far.std
+
+
+@pytest.mark.parametrize("kind", ["position", "orientation"])
+def test_uneven_steps_of_a_clock_are_no_noise(kind):
+    """At 100 deg/s a clock that is uneven by 1 ms moves a reading by more than its noise."""
+    rng = np.random.default_rng(3)
+    time = np.arange(0, 6, 0.007) + rng.uniform(-1e-3, 1e-3, 858)
+    angle = 0.8 * np.sin(2 * time) + 0.3 * np.sin(5 * time) + rng.normal(0, STD, len(time))
+    value = angle[:, None]
+    if kind == "orientation":
+        value = Rotation.from_rotvec(angle[:, None] * [0, 0, 1.0]).as_quat(scalar_first=True)
+        noise = channel_noise(Channel(time, value), kind)
+        assert noise.std == pytest.approx(STD / np.sqrt(3), rel=0.1)
+        return
+    assert channel_noise(Channel(time, value), kind).std == pytest.approx(STD, rel=0.1)
+    even = channel_noise(Channel(np.arange(858) * 0.007, value), kind)
+    assert even.std > 2 * STD

@@ -89,6 +89,13 @@ class FrictionEffect(SurfaceEffect):
         m.geom_friction[geoms, self.column] = np.maximum(values[0] * share / share.max(), MIN_FRICTION)
 
 
+FRICTION_FACTORS = (0.4, 0.7, 1.4, 2.0, 2.8)
+"""Coefficients of sliding friction that are tried, over the model's: a box that tumbles, tumbles another way with each,
+and a fit does not get from one to the other."""
+MAX_FRICTION = 3.0
+"""Largest coefficient of sliding friction."""
+
+
 class SlidingFriction(FrictionEffect):
     """Another coefficient of sliding friction."""
 
@@ -103,7 +110,8 @@ class SlidingFriction(FrictionEffect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return one coefficient."""
         null = self.null(m)
-        return (Parameter("coefficient", "-", null, 0.0, 3.0, 0.15, scan=(0.7 * null, 1.4 * null)),)
+        scan = tuple(value for x in FRICTION_FACTORS if (value := null * x) <= MAX_FRICTION)
+        return (Parameter("coefficient", "-", null, 0.0, MAX_FRICTION, 0.15, scan=scan),)
 
 
 class TorsionalFriction(FrictionEffect):

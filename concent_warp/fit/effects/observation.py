@@ -21,12 +21,16 @@ from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState, partial_state
 from concent_warp.estimation.sample_noise import covariance_std, relative_whitening, whitened
 from concent_warp.estimation.state_estimator import StateEstimator
-from concent_warp.scene.sensor_frame import sensor_frame
+from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
+
+
+MIN_LEVER = 3e-3
+"""Motion of a marker [m or rad] for one of a joint below which it says nothing of the joint."""
 
 
 @dataclass(frozen=True)
@@ -279,9 +283,12 @@ def start_spread(
                 velocity[dof : dof + 3], velocity[dof + 3 : dof + 6] = cfg.unknown_velocity, cfg.unknown_spin
 
     rates: dict[int, float] = {}
+    told: dict[int, float] = {}
+    shown: set[int] = set()
 
     def seen(dof: slice, std: float) -> None:
         here = np.arange(m.nv)[dof]
+        shown.update(here.tolist())
         here = here if measured is None else here[measured[here]]
         position[here] = cfg.state_noise * std
         velocity[here] = cfg.state_noise * std / cfg.velocity_time
@@ -305,13 +312,37 @@ def start_spread(
                 continue
             joint = int(m.body_jntadr[frames[row].body])
             if joint < 0 or m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
+                for dof, lever in _levers(m, frames[row], turn=kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)).items():
+                    told[dof] = min(told.get(dof, np.inf), std / lever)
                 continue
             dof = int(m.jnt_dofadr[joint]) + 3 * (kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
             seen(slice(dof, dof + 3), std)
+    for dof in told.keys() - shown:  # joints without a sensor of their own
+        seen(slice(dof, dof + 1), told[dof])
     for dof, std in rates.items():  # of joints whose position was measured too, the velocity is estimated from both
         if measured is not None and not measured[dof]:
             velocity[dof] = std
     return np.concatenate([position, velocity])
+
+
+def _levers(m: mujoco.MjModel, frame: SensorFrame, *, turn: bool) -> dict[int, float]:
+    """Return by how much a frame moves in the reference pose [m or rad] with each hinge and slide below it, by its dof.
+
+    Those that move it by less than `MIN_LEVER` are left out.
+    """
+    d, place, spin = mujoco.MjData(m), np.zeros((3, m.nv)), np.zeros((3, m.nv))
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    point = d.xpos[frame.body] + d.xmat[frame.body].reshape(3, 3) @ frame.offset
+    mujoco.mj_jac(m, d, place, spin, point, frame.body)
+    moves = np.linalg.norm(spin if turn else place, axis=0)
+    return {int(dof): float(moves[dof]) for dof in np.flatnonzero(moves > MIN_LEVER) if _is_scalar(m, int(dof))}
+
+
+def _is_scalar(m: mujoco.MjModel, dof: int) -> bool:
+    """Return whether a degree of freedom is a hinge or a slide."""
+    kind = int(m.jnt_type[m.dof_jntid[dof]])
+    return kind in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclass(frozen=True)
@@ -324,6 +355,8 @@ class ObservedRecording:
     """Standard deviation of a component of each channel that counts."""
     cfg: ObservationCfg = field(default_factory=ObservationCfg)
     """Settings."""
+    _measured: dict[int, tuple[Demonstration, StateEstimator | None]] = field(default_factory=dict, repr=False)
+    """Estimated motions so far, by the identity of the demonstration."""
 
     def state(self, d: Demonstration, time: float) -> PartialState:
         """Return the state of a demonstration at a time [s], as recorded or measured, else of the reference pose."""
@@ -341,10 +374,13 @@ class ObservedRecording:
 
     def measured(self, d: Demonstration) -> StateEstimator | None:
         """Return the estimated motion of a demonstration, None where the pose of a body or joint was not measured."""
-        try:
-            return StateEstimator.of(self.model, d)
-        except RecordingError:
-            return None
+        if id(d) not in self._measured:
+            try:
+                found = StateEstimator.of(self.model, d)
+            except RecordingError:
+                found = None
+            self._measured[id(d)] = (d, found)
+        return self._measured[id(d)][1]
 
     def window(self, number: int, start: float, end: float) -> Window | None:
         """Return a window; None where nothing was measured in it."""

@@ -114,7 +114,7 @@ def read_episode(
 
 def _unused(episode: Episode, mapping: LogMap, channels: list[Numbers]) -> list[str]:
     """Return the channels of an episode that the map does not name."""
-    named = {one for entry in (*mapping.action.values(), *mapping.measured.values()) for one in entry.source}
+    named = {one for entry in (*mapping.action.values(), *mapping.measured.values()) for one in entry.source if one}
     named |= {entry.source for entry in mapping.body.values()}
     named |= {part for one in channels for part in one.source.split(", ")}
     under = tuple(f"{one}/" for one in named)

@@ -70,7 +70,7 @@ def import_log(
     """
     cfg = cfg or ImportCfg()
     check_settings(cfg, RecordingError)
-    sources = log_sources(source)
+    sources = log_sources(source, _parts(_map_of(mapping)))
     if (bop := _bop_of(sources, model, mapping, cfg)) is not None:
         recording = bop.recording(None if progress is None else lambda share: progress(0.9 * share))
     else:
@@ -101,12 +101,27 @@ def inspect_log(
     """
     cfg = cfg or ImportCfg()
     check_settings(cfg, RecordingError)
-    sources = log_sources(source)
+    sources = log_sources(source, _parts(_map_of(mapping)))
     if (bop := _bop_of(sources, model, mapping, cfg)) is not None:
         yield _inspected(bop, cfg)
         return
     for _, episode in _read(sources, model, mapping, cfg)[1]:
         yield episode
+
+
+def _map_of(mapping: Path | str | LogMap | None) -> LogMap | None:
+    """Return a map, read if it is a file that is there; one that is not there is refused where it is needed."""
+    if mapping is None or isinstance(mapping, LogMap):
+        return mapping
+    return read_map(Path(mapping)) if Path(mapping).exists() else None
+
+
+def _parts(mapping: LogMap | None) -> frozenset[str]:
+    """Return what the sources of a map begin with, which may be names of tables, one for each body."""
+    if mapping is None:
+        return frozenset()
+    numbers = [one for entry in (*mapping.action.values(), *mapping.measured.values()) for one in entry.source]
+    return frozenset(one.partition("/")[0] for one in (*numbers, *(entry.source for entry in mapping.body.values())))
 
 
 def _mapped(
@@ -151,7 +166,8 @@ def _read(
     sources: Sequence[Path], model: Path | str | Scene | None, mapping: Path | str | LogMap | None, cfg: ImportCfg
 ) -> tuple[Scene, Iterator[tuple[float, ReadEpisode]]]:
     """Return the scene, and an iterator over the share of episodes done and each of them, checked."""
-    logs = [open_log(source) for source in sources]
+    parts = _parts(_map_of(mapping))
+    logs = [open_log(source, parts) for source in sources]
     scene = scene_of(_needed(model, "scene", "--model robot.xml"))
     mapping = _needed(mapping, "map", "--map robot.toml, which --suggest writes")
     mapping = mapping if isinstance(mapping, LogMap) else read_map(Path(mapping))

@@ -54,7 +54,7 @@ class NumberEntry:
     """Where an actuator's commands or a sensor's measurements come from."""
 
     source: tuple[str, ...] = ()
-    """Channels, one for each number, or one name under which they lie."""
+    """Channels, one for each number, empty for one that was not measured, or one name under which they lie."""
     constant: float | None = None
     """Command that was the same all the time [SI], in place of a source."""
     unit: str | None = None
@@ -196,8 +196,10 @@ def _value(key: str, value: Any, where: str, kind: str) -> Any:
         return square_matrix(value, where, key, 4)
     if key == "source" and kind != "body":
         listed = [value] if isinstance(value, str) else value
-        if not isinstance(listed, list) or not listed or not all(isinstance(one, str) and one for one in listed):
-            raise RecordingError("source is not right", where=where, expected="a name or a list of names", found=value)
+        texts = isinstance(listed, list) and all(isinstance(one, str) for one in listed)
+        if not texts or not any(listed) or (kind == "action" and not all(listed)):
+            expected = "a name or a list of names, in it an empty one for each component that was not measured"
+            raise RecordingError("source is not right", where=where, expected=expected, found=value)
         return tuple(listed)
     if not isinstance(value, str) or not value:
         raise RecordingError(f"{key} is not a text", where=where, found=repr(value))

@@ -15,6 +15,8 @@ from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.targets import Target
 from concent_warp.recording.logs.units import SHARES, SI, TIMES, UNITS, named_unit
 
+UNSEEN = Signal("", np.zeros(0), np.zeros(0))
+"""In place of a component that the log does not have."""
 LATEST = 4.1e9
 """The year 2100 in seconds since 1970 [s]."""
 
@@ -127,7 +129,7 @@ def converted(
         time, value = time[finite], value[finite]
     if not len(time) or np.isnan(value).all():
         raise RecordingError("the channel has no samples", where=where, found=first.name, fix="leave it out of the map")
-    source = first.name if len(signals) == 1 else ", ".join(signal.name for signal in signals)
+    source = ", ".join(dict.fromkeys(signal.name for signal in signals))
     if len(signals) > 1 and len(entry.source) == 1:
         source = entry.source[0]
     delay = delay_of(first, clocks[0])
@@ -146,9 +148,11 @@ def times_of(stream: Signal | Images, clock: ClockEntry) -> np.ndarray:
     time = np.asarray(given, dtype=float)
     if clock.rate is not None:
         return time / clock.rate + clock.offset
-    if isinstance(stream, Images) and len(time) > 2 and (np.diff(np.sort(time)) == 1).all():
-        fix = f'write [clock] "{stream.name}" = {{ rate = FRAMES_PER_SECOND }} in the map, or timestamps.csv'
-        found = f"{time.min():g} to {time.max():g}, one by one"
+    images = isinstance(stream, Images)
+    if len(time) > 2 and ((np.diff(np.sort(time)) == 1).all() if images else stream.frames):
+        other = "timestamps.csv" if images else "a column time in the table"
+        fix = f'write [clock] "{stream.name}" = {{ rate = FRAMES_PER_SECOND }} in the map, or {other}'
+        found = f"{np.nanmin(time):g} to {np.nanmax(time):g}"
         raise RecordingError("the stamps look like numbers of frames", where=stream.name, found=found, fix=fix)
     time = time * TIMES[clock.unit] + clock.offset
     middle = float(np.median(time)) if len(time) else 0.0
@@ -197,6 +201,9 @@ def _sources(entry: NumberEntry, target: Target, episode: Episode, where: str) -
         raise RecordingError("the entry has no source", where=where, fix="write source = ..., or constant = ...")
     signals: list[Signal] = []
     for source in entry.source:
+        if not source:
+            signals.append(UNSEEN)
+            continue
         if not (found := episode.find(source)):
             known = sorted(episode.signals)
             near = [name for name in known if source.split("/")[0] in name] or known
@@ -212,9 +219,13 @@ def _sources(entry: NumberEntry, target: Target, episode: Episode, where: str) -
             "wrong number of channels", where=where, expected=f"{target.size} for {target.name!r}",
             found=f"{len(signals)}: {listed}", fix=fix,
         )  # fmt: skip
+    first = next(signal for signal in signals if signal is not UNSEEN)
     if target.quantity == "orientation":
+        if UNSEEN in signals:
+            raise RecordingError("a quaternion is whole or missing", where=where, found=list(entry.source))
         return _w_first(signals, entry.order)
-    return signals
+    unseen = replace(first, value=np.full(len(first.value), np.nan))
+    return [unseen if signal is UNSEEN else signal for signal in signals]
 
 
 def _w_first(signals: Sequence[Signal], order: str) -> list[Signal]:

@@ -17,6 +17,8 @@ from concent_warp.recording.logs.numbers import Numbers
 from concent_warp.recording.unwind import TURN, continued, wraps
 
 DEGREE = math.pi / 180
+COUNTS = 720.0
+"""Whole numbers above this are counts of an encoder rather than angles in degrees."""
 
 
 def check_numbers(channels: Sequence[Numbers], cfg: PlausibilityCfg) -> Iterator[RecordingError]:
@@ -95,6 +97,9 @@ def _degrees(one: Numbers, cfg: PlausibilityCfg) -> RecordingError | None:
         if one.unit is None
         else f"check unit = {one.unit!r}, scale and offset"
     )
+    counts = one.unit is None and _are_counts(value)
+    if counts:
+        fix = 'if these are counts of an encoder, write unit = "turn" and scale = 1 / (counts a turn) in the map'
     if one.target.range is not None:
         low, high = one.target.range[0] - cfg.range_margin, one.target.range[1] + cfg.range_margin
         known = value[np.isfinite(value)]
@@ -102,20 +107,29 @@ def _degrees(one: Numbers, cfg: PlausibilityCfg) -> RecordingError | None:
         if outside > cfg.outside_share:
             inside = float(np.mean((known * DEGREE >= low) & (known * DEGREE <= high)))
             degrees = inside > 1 - cfg.outside_share and np.abs(known).max() > math.pi
+            otherwise = fix if counts else "check unit, sign and offset in the map, or the range in the scene"
             return RecordingError(
                 "its values look like degrees" if degrees else "its values are outside the range of the joint",
                 where=one.where, expected=f"{one.target.range[0]:.3g} to {one.target.range[1]:.3g} rad of "
                 f"{one.target.joint or one.target.name!r}",
                 found=f"{known.min():.4g} to {known.max():.4g} from {one.source}",
-                fix=fix if degrees else "check unit, sign and offset in the map, or the range in the scene",
+                fix=fix if degrees else otherwise,
             )  # fmt: skip
     speed = _speed(one.time, value)
     if not one.target.command and len(speed) and (fast := float(np.quantile(speed, 0.95))) > cfg.max_joint_speed:
+        degrees = fast * DEGREE <= cfg.max_joint_speed
+        what = "its speeds look like degrees" if degrees else "its speeds are those of no joint"
         return RecordingError(
-            "its speeds look like degrees", where=one.where, expected=f"at most {cfg.max_joint_speed:g} rad/s",
+            what, where=one.where, expected=f"at most {cfg.max_joint_speed:g} rad/s",
             found=f"{fast:.4g} rad/s from {one.source}", fix=f"{fix}, or check the unit of its clock",
         )  # fmt: skip
     return None
+
+
+def _are_counts(value: np.ndarray) -> bool:
+    """Return whether angles (T,), as they are in the log, are whole numbers beyond two turns in degrees."""
+    known = value[np.isfinite(value)]
+    return bool(len(known) and (known == np.round(known)).all() and np.abs(known).max() > COUNTS)
 
 
 def _against_command(measured: Numbers, command: Numbers, cfg: PlausibilityCfg) -> RecordingError | None:

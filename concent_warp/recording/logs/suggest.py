@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.logs.suggest_vectors import VectorChoice, vector_choices
-from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
+from concent_warp.recording.logs.targets import Target, body_sensors, named_parts, targets_of
 from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
 from concent_warp.scene.scene import Scene
 
@@ -35,6 +35,10 @@ ROOM = 20.0
 """Distance of a body from the origin above which positions are guessed to be in millimetres [m]."""
 MAX_DEGREES = 720.0
 """Largest value that is guessed to be an angle in degrees [deg]."""
+
+
+UNCALLED = "no name says command"
+"""Why torques that are taken for commands of motors may be measured ones."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +63,24 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
         RecordingError: The log cannot be read.
         SceneError: The scene cannot be read.
     """
-    first = log_sources(source)[0]
+    m = scene_of(model).model
+    parts = named_parts(m)
+    first = log_sources(source, parts)[0]
     if first.exists() and log_kind(first) == "bop":
         raise RecordingError("a scene of a BOP data set needs no map", where=first, fix="import it with -o demo.h5")
-    log = open_log(first)
-    m = scene_of(model).model
+    log = open_log(first, parts)
     found = log.episode(log.numbers[0] if episode is None else episode)
     actuators, sensors = targets_of(m)
     commands = [one for one in found.signals.values() if one.command]
     readings = [one for one in found.signals.values() if not one.command]
     lines = [f"# Map from {first.name} ({log.kind}): check every line, above all units and signs.", ""]
-    chosen = _matched(list(actuators.values()), commands)
+    efforts = [one for one in readings if _quantity(one.name) == "effort"]
+    if not commands and len(efforts) == len(actuators) and not any(one.position for one in actuators.values()):
+        readings = [one for one in readings if one not in efforts]
+        named = _matched(list(actuators.values()), efforts)
+        chosen = [replace(one, guess=", ".join(filter(None, (one.guess, UNCALLED)))) for one in named]
+    else:
+        chosen = _matched(list(actuators.values()), commands)
     lines += _section("action", list(actuators.values()), chosen)
     joints = [one for one in sensors.values() if one.size == 1]
     measured = _matched([one for one in joints if one.position], _of(readings, "position"))
@@ -88,6 +99,8 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
         used |= {name for one in vectors for name in one.sources}
         lines += _vectors(several, vectors)
     lines += _images(found)
+    if any(one.frames for one in found.signals.values()):
+        lines += ["# [clock]  # the table has numbers of frames, and no times", '# "*" = { rate = ? }  # in Hz', ""]
     if left := [name for name in found.signals if name not in used]:
         lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
     return "\n".join(lines).rstrip() + "\n"
@@ -104,7 +117,7 @@ def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
 
 def _quantity(name: str) -> str:
     """Return the quantity that a name says, position if it says none."""
-    words = words_of(name)
+    words = [word.rstrip("0123456789") for word in words_of(name)]
     said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
     return said[-1] if said else "position"
 

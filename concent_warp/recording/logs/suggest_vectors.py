@@ -44,12 +44,16 @@ def vector_choices(targets: Iterable[Target], signals: Sequence[Signal], room: f
     for target in wanted:
         axes = AXES[target.size]
         groups = _groups(signals, axes)
-        named = [stem for stem in groups if {*words_of(target.joint)} <= {*stem} and target.joint]
+        parts = [{*words_of(name)} for name in (target.joint, target.name) if name]
+        named = [stem for stem in groups if any(words <= {*stem} for words in parts)]
         named.sort(key=len)  # what its name says beside the body may make it another thing
         alone = len(groups) == 1 == sum(other.size == target.size for other in wanted)
         if stems := named[:1] or (list(groups) if alone else []):
-            sources = tuple(groups[stems[0]][axis] for axis in axes)
-            unit, guesses = named_unit(sources[0], target.quantity), [] if named else ["the only ones"]
+            sources = tuple(groups[stems[0]].get(axis, "") for axis in axes)
+            first = next(filter(None, sources))
+            unit, guesses = named_unit(first, target.quantity), [] if named else ["the only ones"]
+            if "" in sources:
+                guesses.append("not all components are in the log")
             values = np.concatenate([one.value for one in signals if one.name in sources])
             far = float(np.nanmax(np.abs(values), initial=0.0))
             if unit is None and target.quantity == "length" and far > room:
@@ -60,7 +64,10 @@ def vector_choices(targets: Iterable[Target], signals: Sequence[Signal], room: f
 
 
 def _groups(signals: Sequence[Signal], axes: str) -> Mapping[tuple[str, ...], Mapping[str, str]]:
-    """Return the names of channels that differ in their components alone, by component, by what they share."""
+    """Return the names of channels that differ in their components alone, by component, by what they share.
+
+    Of a position two components are enough, as of markers that one camera tracks.
+    """
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for one in signals:
         words = words_of(one.name)
@@ -70,4 +77,9 @@ def _groups(signals: Sequence[Signal], axes: str) -> Mapping[tuple[str, ...], Ma
             found.setdefault((*words[:-1], hit[1]), {})[hit[2]] = one.name
     # Those of a quaternion are four, so that x, y and z of one are no position.
     letters = BEFORE[len(axes)]
-    return {stem: names for stem, names in found.items() if set(names) == set(axes) and stem[-1] in letters}
+    least = len(axes) if len(axes) > 3 else 2
+    return {
+        stem: names
+        for stem, names in found.items()
+        if set(names) <= set(axes) and len(names) >= least and stem[-1] in letters
+    }

@@ -71,6 +71,14 @@ def targets_of(m: mujoco.MjModel) -> tuple[dict[str, Target], dict[str, Target]]
     return actuators, sensors
 
 
+def named_parts(m: mujoco.MjModel) -> frozenset[str]:
+    """Return the names of all that a table of its own may be of: bodies, joints, sites, geoms, sensors, actuators."""
+    names = [m.body(i).name for i in range(1, m.nbody)] + [m.joint(i).name for i in range(m.njnt)]
+    names += [m.site(i).name for i in range(m.nsite)] + [m.geom(i).name for i in range(m.ngeom)]
+    names += [m.sensor(i).name for i in range(m.nsensor)] + [m.actuator(i).name for i in range(m.nu)]
+    return frozenset(names) - {""}
+
+
 def body_sensors(m: mujoco.MjModel, body: str) -> tuple[str | None, str | None]:
     """Return the sensors of a body's position and orientation in the world, None where there is none."""
     found: list[str | None] = []

@@ -54,7 +54,7 @@ def test_the_spread_of_an_initial_state_follows_from_the_noise_of_what_shows_it(
         ("place", [3, 4, 5]),
         ("turned", [6, 7, 8]),
         ("fixed", []),
-        ("link", []),
+        ("link", [0]),
         ("mark", [3, 4, 5]),
         ("rate", []),
     ):

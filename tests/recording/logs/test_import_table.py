@@ -343,3 +343,36 @@ def test_millimetres_of_a_slide_are_noticed_beside_its_velocity(tmp_path):
         import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
     (tmp_path / "map.toml").write_text('[measured]\np = { source = "p", unit = "mm" }\nv = "v"\n')
     assert import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+
+
+@pytest.mark.parametrize("limits", ["", ' range="-110 110"'])
+def test_counts_of_an_encoder_are_told_from_degrees(tmp_path, limits):
+    (tmp_path / "robot.xml").write_text(
+        f"""<mujoco><worldbody><body><joint name="q" axis="0 1 0"{limits}/><geom size="0.1"/></body></worldbody>
+        <sensor><jointpos name="angle" joint="q"/></sensor></mujoco>"""
+    )
+    rows = [f"{t:.2f},{round(16384 / 6.283 * np.sin(3 * t))}" for t in TIME]
+    (tmp_path / "a.csv").write_text("t,ticks\n" + "\n".join(rows))
+    entry = '[measured.angle]\nsource = "ticks"\n'
+    (tmp_path / "map.toml").write_text(entry)
+    with pytest.raises(
+        RecordingError, match=r'counts of an encoder, write unit = "turn" and scale = 1 / \(counts a turn'
+    ):
+        import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml")
+    (tmp_path / "map.toml").write_text(f'{entry}unit = "turn"\nscale = {1 / 16384}\n')
+    (d,) = import_log(tmp_path / "a.csv", tmp_path / "robot.xml", mapping=tmp_path / "map.toml").demonstrations
+    np.testing.assert_allclose(d.measured["angle"].value[:, 0], np.sin(3 * TIME), atol=1e-3)
+
+
+def test_torques_are_suggested_for_motors_where_nothing_is_called_a_command(tmp_path):
+    model = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+    <body><joint name="b" axis="0 1 0"/><geom size="0.1"/></body></body></worldbody><actuator>{}</actuator>
+    <sensor><jointpos name="a" joint="a"/><jointpos name="b" joint="b"/></sensor></mujoco>"""
+    (tmp_path / "robot.xml").write_text(model.format('<motor name="a" joint="a"/><motor name="b" joint="b"/>'))
+    (tmp_path / "a.csv").write_text("t,a (deg),b (deg),torque1 (Nm),torque2 (Nm)\n0,1,2,3,4\n")
+    text = suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")
+    assert '[action.a]  # guess: by order, no name says command\nsource = "torque1 (Nm)"\n' in text
+    assert '[measured.b]\nsource = "b (deg)"\nunit = "deg"\n' in text
+    servos = '<position name="a" joint="a" kp="1"/><position name="b" joint="b" kp="1"/>'
+    (tmp_path / "robot.xml").write_text(model.format(servos))
+    assert "# [action.a]  # no channel found" in suggest_map(tmp_path / "a.csv", tmp_path / "robot.xml")

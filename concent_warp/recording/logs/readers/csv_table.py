@@ -10,7 +10,7 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -54,13 +54,19 @@ def tables_in(folder: Path) -> list[Path]:
     return sorted(one for one in folder.iterdir() if one.suffix.lower() in TABLES and one.is_file())
 
 
-def is_one_episode(folder: Path) -> bool:
+def is_one_episode(folder: Path, parts: Collection[str] = ()) -> bool:
     """Return whether the tables of a folder are parts of one episode: two or more without a common column of numbers.
 
-    The tables of several episodes have the same columns.
+    The tables of several episodes have the same columns. So have those of several bodies: `parts` tells them.
+
+    Args:
+        folder: The folder.
+        parts: Names that parts of an episode have, such as those of bodies; tables that all have such names are one.
     """
     seen: set[str] = set()
     tables = tables_in(folder)
+    if len(tables) > 1 and all(path.stem in parts for path in tables):
+        return True
     for path in tables:
         try:
             header = [name.strip() for name in next(table_rows(path), (0, [""]))[1]]
@@ -106,7 +112,8 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
     for k, column in enumerate(columns):
         if k not in used and (values := column.numbers(path)) is not None:
             name = folder + column.name
-            found[name] = Signal(name, times, values, command=COMMAND.search(name) is not None, sparse=True)
+            command = COMMAND.search(name) is not None
+            found[name] = Signal(name, times, values, command=command, sparse=True, frames=stamps.frames)
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -22,8 +22,8 @@ INTRINSICS = ("intrinsics.json", "camera_intrinsic.json", "intrinsic.json", "cam
 BOP_CAMERAS = "scene_camera.json"
 
 
-def log_kind(path: Path) -> LogKind | None:
-    """Return the kind of log that a file or folder is, None for none that is known."""
+def log_kind(path: Path, parts: Collection[str] = ()) -> LogKind | None:
+    """Return the kind of log that a file or folder is, None for none that is known; `parts` as in `is_one_episode`."""
     if path.is_dir():
         if (path / "meta" / "info.json").exists():
             return "lerobot"
@@ -34,7 +34,7 @@ def log_kind(path: Path) -> LogKind | None:
         folders = {one.name.lower() for one in path.iterdir() if one.is_dir()}
         if folders & {*COLOUR_FOLDERS, *DEPTH_FOLDERS} or any((path / name).exists() for name in INTRINSICS):
             return "images"
-        return "table" if is_one_episode(path) and not _holds_other_logs(path) else None
+        return "table" if is_one_episode(path, parts) and not _holds_other_logs(path) else None
     if path.suffix.lower() in TABLES and path.exists():
         return "table"
     return "ros" if path.suffix.lower() in BAGS and path.exists() else None
@@ -45,10 +45,10 @@ def _holds_other_logs(folder: Path) -> bool:
     return any(log_kind(one) not in ((None,) if one.is_dir() else (None, "table")) for one in folder.iterdir())
 
 
-def log_sources(source: Path | str | Sequence[Path | str]) -> list[Path]:
+def log_sources(source: Path | str | Sequence[Path | str], parts: Collection[str] = ()) -> list[Path]:
     """Return the logs that are meant: a folder that is no log stands for the logs in it, in the order of their names.
 
-    Tables beside logs of another kind are notes on these, and left out.
+    Tables beside logs of another kind are notes on these, and left out. `parts` as in `is_one_episode`.
 
     Raises:
         RecordingError: None is named, or one is named twice.
@@ -56,8 +56,8 @@ def log_sources(source: Path | str | Sequence[Path | str]) -> list[Path]:
     named = [Path(source)] if isinstance(source, Path | str) else [Path(one) for one in source]
     found: list[Path] = []
     for path in named:
-        inside = sorted(path.iterdir()) if path.is_dir() and log_kind(path) is None else []
-        kinds = {one: kind for one in inside if (kind := log_kind(one)) is not None}
+        inside = sorted(path.iterdir()) if path.is_dir() and log_kind(path, parts) is None else []
+        kinds = {one: kind for one in inside if (kind := log_kind(one, parts)) is not None}
         found += [one for one, kind in kinds.items() if kind != "table"] or list(kinds) or [path]
     if not found:
         raise RecordingError("no log is named", expected=KINDS)

@@ -33,6 +33,8 @@ class Signal:
     sparse: bool = False
     """Whether its samples are among those of other channels, as in a table with a row for each of either: samples
     without a value are then none."""
+    frames: bool = False
+    """Whether the stamps are numbers of frames."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 from concent_warp.errors import RecordingError
@@ -13,8 +14,8 @@ from concent_warp.recording.logs.readers.log import Log
 from concent_warp.recording.logs.readers.ros import RosLog
 
 
-def open_log(path: Path | str) -> Log:
-    """Open a LeRobot data set, an MCAP file, a ROS bag, a table or a folder of images.
+def open_log(path: Path | str, parts: Collection[str] = ()) -> Log:
+    """Open a LeRobot data set, an MCAP file, a ROS bag, a table or a folder of images; `parts` as in `log_sources`.
 
     Raises:
         RecordingError: There is none of them, or its description cannot be read.
@@ -22,7 +23,7 @@ def open_log(path: Path | str) -> Log:
     path = Path(path)
     if not path.exists():
         raise RecordingError("no such log", where=path, expected=KINDS, fix="check the path")
-    kind = log_kind(path)
+    kind = log_kind(path, parts)
     if kind == "lerobot":
         return LeRobotLog(path)
     if kind == "ros":
@@ -36,4 +37,5 @@ def open_log(path: Path | str) -> Log:
     if path.suffix in (".h5", ".hdf5", ".pt"):
         raise RecordingError("this is no log to import", where=path, fix="every command reads it as it is")
     found = path.suffix or ("another folder" if path.is_dir() else "no suffix")
-    raise RecordingError("unknown kind of log", where=path, expected=KINDS, found=found)
+    fix = "write it as a table, or as a recording: docs/recording.md, Writing one" if path.is_file() else None
+    raise RecordingError("unknown kind of log", where=path, expected=KINDS, found=found, fix=fix)

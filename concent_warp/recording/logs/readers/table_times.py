@@ -2,7 +2,7 @@
 
 One column, `time`, `timestamp`, `t` and alike, also with a unit (`time_ms`, `Time (Seconds)`) or signs before it
 (`%time`, `__time`); it may have a second of what is left of whole seconds (`time_sec` and `time_nsec`). Else columns
-whose names end so (`header.stamp`, or `header.stamp.secs` and `.nsecs`).
+whose names end so (`header.stamp`, or `header.stamp.secs` and `.nsecs`), else numbers of frames.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ TIME = re.compile(rf"[^a-z0-9]*{_NAME}{_UNIT}", re.IGNORECASE)
 """Names of a column of times, with its unit."""
 ENDS_IN_TIME = re.compile(rf"(?:.*[^a-z])(?:time|timestamp|time_?stamp|stamp){_UNIT}", re.IGNORECASE)
 """Names that end in one of these, behind a prefix such as a topic."""
+FRAME = re.compile(r"[^a-z0-9]*frame[ _.]?(?:id|index|idx|no|nr|num|number|count)?[^a-z0-9]*", re.IGNORECASE)
+"""Names of a column of numbers of frames, which count where there are no times."""
 PART = re.compile(rf"(|.*[^a-z]|.*time|.*stamp)({'|'.join(UNITS)})", re.IGNORECASE)
 """A name that ends in a unit as a word of its own: no `status`."""
 
@@ -47,6 +49,8 @@ class Stamps:
     rest: int | None = None
     """Column of what is left of the seconds, where there is one."""
     rest_unit: str = ""
+    frames: bool = False
+    """Whether they are numbers of frames, of which the map states the rate."""
     _time: array[float] = field(default_factory=lambda: array("d"))
     _rest: array[float] = field(default_factory=lambda: array("d"))
 
@@ -71,11 +75,14 @@ class Stamps:
                 fix = "rename the one that is meant to time"
                 listed = [header[k] for k, _ in named[:12]]
                 raise RecordingError("several columns of a table may be the time", where=where, found=listed, fix=fix)
+            frames = [k for k, name in enumerate(header) if FRAME.fullmatch(name)]
+            if not named and len(frames) == 1 and len(header) > 1:
+                return Stamps(frames[0], "", frames=True)
         if len(header) < 2 or not (named or parts):
             raise RecordingError(
                 "a table has no times", where=where, found=",".join(header)[:200],
-                expected="names in the first line, one of them time or timestamp, also with a unit as in time_ms, or "
-                "two as time_sec and time_nsec",
+                expected="names in the first line, one of them time or timestamp, also with a unit as in time_ms, two "
+                "as time_sec and time_nsec, or frame for numbers of frames",
             )  # fmt: skip
         # A duration in two columns, such as time_from_start, may stand before the time.
         first = named[0][0] if named else min(parts)
