@@ -1,9 +1,10 @@
-"""Make the two animations of the README: a fitted replay beside the unfitted one, and a policy inserting in Reality.
+"""Make the two animations of the README: a fitted replay beside the unfitted one, and the whole task in Reality.
 
     make demo
     python docs/images/animations.py runs/demo      # two to three minutes on two cores
 
-Writes fit.webp and policy.webp beside this script. Images are traced by MuJoCo-Warp on the CPU: no display is needed.
+Writes fit.webp, policy.webp and, five pictures of the latter, pick_align_insert.png beside this script. Images are
+traced by MuJoCo-Warp on the CPU: no display is needed.
 """
 
 import sys
@@ -26,6 +27,8 @@ EYE, TARGET = (0.82, -0.30, 0.25), (0.48, -0.01, 0.06)
 """Where the camera of the replays stands and what it looks at [m]."""
 RATE = 12.5
 """Pictures a second of the replays."""
+SHOWN = (0.5, 0.65, 0.75, 0.88, 1.0)
+"""Times of the pictures of an episode, as shares of its duration."""
 
 
 def replayed_images(model: cw.Model, recording: cw.Recording, times: np.ndarray) -> list[Image.Image]:
@@ -97,6 +100,12 @@ def policy() -> None:
     height = SIZE[0] + 22
     small = [image.resize((round(image.width * height / image.height), height)) for image in keep]
     write(HERE / "policy.webp", small, 2 * RATE)
+    shown = [every[round(share * (len(every) - 1))] for share in SHOWN]
+    width, height = shown[0].size
+    strip = Image.new("RGB", (len(shown) * (width + 4) - 4, height), "white")
+    for k, image in enumerate(shown):
+        strip.paste(image, (k * (width + 4), 0))
+    strip.save(HERE / "pick_align_insert.png")
 
 
 if __name__ == "__main__":
