@@ -69,6 +69,11 @@ class Finding:
         """`p` as text: "p = 0.03", or "p <= 0.0025" at the smallest that the null distribution can give."""
         return p_value_text(self.p, self.smallest_p)
 
+    @property
+    def may_be_null(self) -> bool:
+        """Whether each parameter, by itself, may be at the value at which the effect does nothing."""
+        return bool(self.parameters) and not any(p.excludes_null for p in self.parameters)
+
     def to_json(self) -> dict[str, Any]:
         """Return the finding in plain types."""
         return {
@@ -341,6 +346,8 @@ class Diagnosis:
             )
             if len(group) > 1:
                 said.append(f"The data cannot distinguish it from {_joined(group[1:])}.")
+            if finding.may_be_null:
+                said.append(f"Each interval of {finding.name} includes no change: the fall of the error speaks for it.")
         if self.verdict == "none_of_these":
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."

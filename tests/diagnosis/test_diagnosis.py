@@ -61,6 +61,15 @@ def test_an_effect_is_named_with_value_interval_gain_and_chance():
     )
 
 
+def test_an_effect_whose_intervals_include_no_change_is_said_to_rest_on_the_error_alone():
+    friction = finding("joint_friction", 0.8)
+    wide = replace(friction.parameters[0], low=-0.01)
+    for parameters, said in (((wide,), True), ((wide, friction.parameters[0]), False)):
+        sentences = diagnosis(effects=(replace(friction, parameters=parameters),)).sentences()
+        sentence = "Each interval of joint_friction includes no change: the fall of the error speaks for it."
+        assert (sentence in sentences) is said
+
+
 def test_indistinguishable_effects_are_named_together():
     found = diagnosis(verdict="group", groups=(("joint_friction", "joint_damping", "backlash"),))
     assert found.sentences()[1] == "The data cannot distinguish it from joint_damping or backlash."
