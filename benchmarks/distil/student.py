@@ -72,12 +72,12 @@ commands tell a blind student most of what it needs. In the whole task both obje
 """
 NOTES = """\
 This benchmark was not run to its end: rows were measured by the commands below and entered by a script, with one
-teacher, the policy of the whole task that came with the package until 2026-11-27 (seed 31), `concent evaluate --episodes
-200` in each world, `--seed 3` for the student by DAgger and those by 700 and 560 iterations, 2 for those by 230, 1 for
-the residual ones and the teacher, 0 for the others. The teacher acted on CPUs; the blind student has 100
-episodes in Reality. The stress test has 200 episodes of students by 700 and 560 iterations; of those by 230, 16 of the
-first seed, and of the teacher 100, on CPUs, `--seed 2`. Simulated trials have the looks that the student was trained
-with.
+teacher, the policy of the whole task that came with the package until 2026-11-27 (seed 31), `concent evaluate
+--episodes 200` in each world, `--seed 3` for the student by DAgger and those by 700 and 560 iterations, 2 for those
+by 230, 1 for the residual ones and the teacher, 0 for the others. The teacher acted on CPUs; the blind student has
+100 episodes in Reality. The stress test has 200 episodes of students by 700 and 560 iterations; of those by 230, 16
+of the first seed, and of the teacher 100, on CPUs, `--seed 2`. Simulated trials have the looks that the student was
+trained with.
 
 - *By DAgger*: the defaults, 1,100 iterations, `concent distil TEACHER --checkpoint 100000`, on one of four H200s beside
   trainings and diagnoses. Predicted positions are 1.7 mm off on average, and it succeeds no more often in Reality than
