@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
@@ -85,6 +86,10 @@ EXAMPLES = {
     "train-flow": "concent train-flow dataset -o runs/flow",
 }
 """One example of each command, shown by its help."""
+OF_NO_TYPE = re.compile(
+    r"^error parsing (\S+): no type matching (\S+) could be instantiated from \[(.*?)\]", re.IGNORECASE
+)
+"""What tyro says of a value that is of none of the types that an option may have."""
 LOADING_AFTER = 1.5
 """Time after which a command that has not yet printed anything says that it is loading [s]."""
 
@@ -213,6 +218,9 @@ def parser_sentence(box: str) -> str:
     parts = [part for part in parts if part] or [[]]
     words = (" ".join(line.split()) + "," * line.startswith(" ") for line in parts[0])
     said = " ".join(words).rstrip(",") or "the options are not right"
+    if unfit := OF_NO_TYPE.search(said):  # what was tried, one type after the other, says less than the value
+        option, kinds, value = unfit.groups()
+        said = f"{option} is not right; expected {kinds.replace('{None}|', '')}, found {value}"
     said = f"{said[0].lower()}{said[1:]}".rstrip(".")
     meant = [line.split()[0].rstrip(",") for part in parts[1:2] if "meant" in part[0] for line in part[1:]]
     return f"{said}; perhaps {' or '.join(meant[:3])} is meant" if meant else said

@@ -199,12 +199,7 @@ def _closed_by_loops(
     closed = close_loops(m, qpos, known.dof[loose])
     if closed is None:
         return {}
-    found: dict[int, Signal] = {}
-    for k in np.flatnonzero(loose):
-        signal = smoother.signal(Channel(time, closed[:, [known.qpos[k]]]), None, "joint")
-        if signal is not None:
-            found[int(k)] = signal
-    return found
+    return _smoothed(smoother, time, closed[:, known.qpos[loose]], loose)
 
 
 def _told_by_poses(
@@ -222,7 +217,11 @@ def _told_by_poses(
     told = marked_joints(m, demonstration, known.dof[loose], known.dof[~loose].tolist())
     if told is None:
         return {}
-    time, value = told
+    return _smoothed(smoother, *told, loose)
+
+
+def _smoothed(smoother: SmootherCfg, time: np.ndarray, value: np.ndarray, loose: np.ndarray) -> dict[int, Signal]:
+    """Return the signals of joints by their index, from positions (T, U) of those that are loose, (J,) bool."""
     found: dict[int, Signal] = {}
     for column, k in enumerate(np.flatnonzero(loose)):
         signal = smoother.signal(Channel(time, value[:, [column]]), None, "joint")

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.select import driven_joints
+from concent_warp.estimation.marked_joints import joints_below
 from concent_warp.recording.recording import Demonstration
 
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -28,11 +29,7 @@ def jointed_pose(
         None where a joint between the world and the body was not measured, is driven by an actuator, or is no hinge or
         slide, where they were measured at different times, and for a body without joints.
     """
-    joints, row = [], m.body(body).id
-    while row:
-        start, count = int(m.body_jntadr[row]), int(m.body_jntnum[row])
-        joints += range(start, start + count)
-        row = int(m.body_parentid[row])
+    joints = joints_below(m, m.body(body).id)
     driven = {joint for i in range(m.nu) for joint in driven_joints(m, i)}
     if not joints or driven & set(joints) or any(int(m.jnt_type[j]) not in SCALAR for j in joints):
         return None

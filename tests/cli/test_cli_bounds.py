@@ -179,6 +179,7 @@ LINES = [
     ("splat-fit images --fit.degree 4", "--fit.degree is out of bounds; expected at least 0 and at most 3"),
     ("render-train demo.h5 --flow.ema 1", "--flow.ema is out of bounds; expected at least 0 and below 1"),
     ("fit demo.h5 --fit.generations many", "error parsing --fit.generations: invalid literal for int()"),
+    ("train demo.h5 --model m.toml --iterations x", "--iterations is not right; expected INT, found 'x'; see concent"),
     ("fit demo.h5 --fit.generatons 3", "unrecognized options: --fit.generatons, 3; perhaps --fit.generations"),
     ("fit", "missing from concent fit: PATH; see concent fit --help."),
     ("train", "missing from concent train: PATH, --model PATH; see concent train --help."),
