@@ -393,6 +393,20 @@ class StressCfg:
 
 
 @dataclass(frozen=True)
+class FinishCfg:
+    """The last iterations of a training, in physics with more contacts than those of the demonstration.
+
+    Spheres outside the physics let a policy slide through places where real objects touch and get stuck.
+    """
+
+    share: Share = 0.33
+    """Share of the iterations; 0 for none."""
+    physics: Literal["spheres", "shapes"] = "spheres"
+    """What collides: all spheres of the objects, or the shapes of the scene's geoms in stiff contacts and short steps,
+    as in the stress test; all spheres where the scene has no shapes to collide with."""
+
+
+@dataclass(frozen=True)
 class TrainCfg:
     """Settings of a training.
 
@@ -413,11 +427,19 @@ class TrainCfg:
     """The environment."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Settings of PPO."""
+    finish: FinishCfg = field(default_factory=FinishCfg)
+    """The last iterations, in physics with more contacts."""
     stress: StressCfg = field(default_factory=StressCfg)
     """The stress test, by which the policy is chosen."""
 
     def __post_init__(self) -> None:
         check_cfg(self)
+
+    @property
+    def finish_from(self) -> int:
+        """Iterations before those of `finish`."""
+        same = self.finish.physics == "spheres" and self.environment.collision == "full"
+        return self.ppo.iterations - (0 if same else round(self.finish.share * self.ppo.iterations))
 
     @staticmethod
     def for_stage(stage: str) -> TrainCfg:

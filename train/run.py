@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from concent_warp.train.learning.ppo import CHECKPOINT, Examination, Iteration, 
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.episodes import PolicyFunction
-from concent_warp.train.trials.stress import StressTest
+from concent_warp.train.trials.stress import StressTest, with_shapes
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
 CHANGEABLE = ("iterations", "checkpoint", "target", "capture", "fuse")
@@ -166,11 +167,19 @@ def train_run(
         check_worlds(task, run.cfg.environment, device)  # before much is computed
         states = sample_reset_states(task, run.cfg.environment.reset, seed, device=device)
 
-        def make(buffers: tuple[int, int] | None = None) -> Environment:
-            cfg = run.cfg.environment
+        def make(buffers: tuple[int, int] | None = None, finishing: bool = False) -> Environment:
+            cfg, given = run.cfg.environment, task
+            options: dict[str, Any] = {}
+            if finishing:
+                cfg = replace(cfg, collision="full")
+                given = run.task(cfg)
+                if run.cfg.finish.physics == "shapes":
+                    given, stress = with_shapes(given, run.cfg.stress), run.cfg.stress
+                    cfg = replace(cfg, stride=1)
+                    options = {"refine": steps_for(given, stress.time_constant), "time_constant": stress.time_constant}
             if buffers is not None:
                 cfg = replace(cfg, nconmax=buffers[0], njmax=buffers[1])
-            return make_environment(task, cfg, states, device=device, seed=seed)
+            return make_environment(given, cfg, states, device=device, seed=seed, **options)
 
         def examination() -> Examination:
             test = run.stress_test(device=device)
@@ -197,6 +206,11 @@ def train_run(
         if begun is not None:
             trainer.folder = begun()
     return trainer, trainer.learn(report, seconds=seconds)
+
+
+def steps_for(task: Task, time_constant: float) -> int:
+    """Return the simulation steps per time step of a task's model that contacts of a time constant [s] need."""
+    return math.ceil(2 * task.compiled.opt.timestep / time_constant - 1e-9)
 
 
 def check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:

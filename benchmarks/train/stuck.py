@@ -3,10 +3,10 @@
     python -m benchmarks.train.stuck runs/a/policy runs/b/policy ...    # run folders of one stage, then the page
 
 Each policy runs from the same initial states in the physics of its training, in the model's own (elliptic cones, its
-time step) and in Reality. The states in which it neither succeeds nor fails in Reality (*stuck*) are set in both
-simulations, at rest, and the policy continues from them for the length of an episode. No parameter is sampled. *turned*
-and *slid* are medians over the stuck states of the motion of object 1 in the hand. The figures do not show why a state
-is not solved, nor other tasks.
+time step), in the first with all spheres in it, and in Reality. The states in which it neither succeeds nor fails in
+Reality (*stuck*) are set in the simulations, at rest, and the policy continues from them for the length of an episode.
+No parameter is sampled. *turned* and *slid* are medians over the stuck states of the motion of object 1 in the hand.
+What is empty was not measured. The figures do not show why a state is not solved, nor other tasks.
 """
 
 from __future__ import annotations
@@ -63,14 +63,15 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
     trained = replace(
         run.cfg.environment, worlds=args.episodes, engine="mujoco", dropped=LOST, randomisation=RandomisationCfg()
     )
-    own = replace(trained, cone="auto", stride=1)
+    own, whole = replace(trained, cone="auto", stride=1), replace(trained, collision="full")
+    everything = run.task(whole)
 
     def policy(environment: Environment) -> PolicyFunction:
         torch.manual_seed(args.seed)
         return loaded.act_in(environment)
 
     def succeeded(cfg: EnvironmentCfg, starts: ResetStates) -> np.ndarray:
-        environment = make_environment(task, cfg, starts, device="cpu")
+        environment = make_environment(everything if cfg is whole else task, cfg, starts, device="cpu")
         return outcomes(environment, policy(environment))[0]
 
     real = reality_environment(task, trained, states, IDEAL)
@@ -91,7 +92,7 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
         "settings": changed(json.loads(json.dumps(asdict(TrainingRun.load(folder).cfg)))),
         "machine": machine(),
     }
-    for name, cfg in (("training", trained), ("own", own)):
+    for name, cfg in (("training", trained), ("own", own), ("all spheres", whole)):
         found[name] = int(succeeded(cfg, states).sum())
         found[f"{name}, from stuck"] = int(succeeded(cfg, starts)[stuck].sum()) if stuck.any() else 0
     return found
@@ -133,12 +134,18 @@ def outcomes(environment: Environment, policy: PolicyFunction) -> tuple[np.ndarr
 def page(data: dict[str, dict[str, Any]]) -> str:
     """Return the page."""
     head = [
-        "policy", "episodes", "in the physics of its training", "in the model's own", "in Reality",
+        "policy", "episodes", "in the physics of its training", "in the model's own", "with all spheres", "in Reality",
         "stuck there", "turned in the hand", "slid", "from these: in the physics of its training", "in the model's own",
+        "with all spheres",
     ]  # fmt: skip
-    names = ("episodes", "training", "own", "reality", "stuck")
+    names = ("episodes", "training", "own", "all spheres", "reality", "stuck")
     lines = [
-        [name, *(str(row[n]) for n in names), *in_the_hand(row), *(str(row[f"{n}, from stuck"]) for n in names[1:3])]
+        [
+            name,
+            *(str(row.get(n, "")) for n in names),
+            *in_the_hand(row),
+            *(str(row.get(f"{n}, from stuck", "")) for n in names[1:4]),
+        ]
         for name, row in data.items()
     ]
     settings = [

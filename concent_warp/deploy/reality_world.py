@@ -60,4 +60,5 @@ def reality_environment(
     pads = pad_geoms(model, cfg.action.gripper_actuators)
     fields = world.variation.sample(model, names, pads, cfg.worlds, np.random.default_rng([seed, 3]))
     physics = MujocoPhysics(model, cfg.worlds, steps, actors=actors, fields=fields)
-    return Environment(task, replace(cfg, collision="full"), physics, states, world.sensors)
+    physical = replace(cfg, collision="full", virtual=replace(cfg.virtual, points=0))
+    return Environment(task, physical, physics, states, world.sensors)

@@ -83,7 +83,7 @@ def test_larger_buffers_change_nothing_else():
     for rebuilt in (False, True):
         trainer, _ = trained(made(60, 200, 1), None)
         if rebuilt:
-            trainer._rebuild((120, 400))
+            trainer._rebuild((120, 400), finishing=False)
         trainer.cfg = replace(trainer.cfg, ppo=replace(trainer.cfg.ppo, iterations=3))
         trainer.learn()
         weights.append(trainer.algorithm.actor.state_dict())

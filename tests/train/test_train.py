@@ -4,6 +4,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 from small_insertion import EXACT_STATE, SETTINGS, make_demonstration, make_model
@@ -14,14 +16,15 @@ from concent_warp.events.extract import extract
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import PpoCfg, StressCfg, TrainCfg
+from concent_warp.train.cfg import FinishCfg, PpoCfg, StressCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import CURVE, read_curve
-from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, load_checkpoint
+from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, Trainer, load_checkpoint
 from concent_warp.train.observation_cfg import ObservationCfg
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
+from concent_warp.train.task.task import Task
 from concent_warp.train.trials.evaluate import run_episodes, wilson
 
 LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
@@ -57,21 +60,72 @@ def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
     assert trained.rate >= 0.8
 
 
-def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, tmp_path):
-    train_run(made, tmp_path / "whole", device="cpu")
-    half = replace(made, cfg=replace(made.cfg, ppo=replace(SHORT, iterations=2)))
-    train_run(half, tmp_path / "parts", device="cpu")
-    with (tmp_path / "parts" / CURVE).open("a") as file:  # a round after the checkpoint, which is done again
-        file.write(json.dumps({"iteration": 3, "steps": 48, "seconds": 0.1}) + "\n")
-    _, last = train_run(made, tmp_path / "parts", device="cpu", resume=True)
+@pytest.fixture(scope="module")
+def whole(made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a training that takes all spheres after half of its iterations."""
+    folder = tmp_path_factory.mktemp("whole")
+    train_run(replace(made, cfg=replace(made.cfg, finish=FinishCfg(share=0.5))), folder, device="cpu")
+    return folder
+
+
+@pytest.mark.parametrize("stop", [1, 2, 3])
+def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, whole, tmp_path, stop):
+    def interrupt(this: Iteration) -> None:
+        if this.iteration == stop:
+            raise KeyboardInterrupt
+
+    same = replace(made, cfg=replace(made.cfg, finish=FinishCfg(share=0.5)))
+    with pytest.raises(KeyboardInterrupt):
+        train_run(same, tmp_path, device="cpu", report=interrupt)
+    with (tmp_path / CURVE).open("a") as file:  # a round after the checkpoint, which is done again
+        file.write(json.dumps({"iteration": stop + 1, "steps": 16 * (stop + 1), "seconds": 0.1}) + "\n")
+    _, last = train_run(same, tmp_path, device="cpu", resume=True)
     assert last is not None
     assert (last.iteration, last.steps) == (4, 64)
-    for folder in ("whole", "parts"):
-        rounds = read_curve(tmp_path / folder)
+    for folder in (whole, tmp_path):
+        rounds = read_curve(folder)
         assert [(row["iteration"], row["steps"]) for row in rounds] == [(1, 16), (2, 32), (3, 48), (4, 64)]
-    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
-    for name, value in whole.items():
-        torch.testing.assert_close(parts[name], value, rtol=0, atol=0)
+    expected, found = weights(whole), weights(tmp_path)
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("collision", "finish", "expected"),
+    [
+        ("vcp", FinishCfg(share=0.5), ["events", "events", "spheres", "spheres"]),
+        ("vcp", FinishCfg(share=0.25, physics="shapes"), ["events", "events", "events", "shapes"]),
+        ("vcp", FinishCfg(share=0), ["events"] * 4),
+        ("full", FinishCfg(share=0.5), ["spheres"] * 4),
+        ("full", FinishCfg(share=0.25, physics="shapes"), ["spheres", "spheres", "spheres", "shapes"]),
+    ],
+)
+def test_more_collides_in_the_last_iterations(made, monkeypatch, collision, finish, expected):
+    environment = replace(made.cfg.environment, collision=collision)
+    whole, trainers, found = Trainer.learn, [], []
+
+    def learn(self: Trainer, *args, **options):
+        trainers.append(self)
+        return whole(self, *args, **options)
+
+    def note(_: Iteration) -> None:
+        found.append(colliding(trainers[0].environment.task))
+
+    monkeypatch.setattr(Trainer, "learn", learn)
+    run = replace(made, cfg=replace(made.cfg, environment=environment, finish=finish))
+    train_run(run, None, device="cpu", report=note)
+    assert found == expected
+
+
+def colliding(task: Task) -> str:
+    """Return what of the objects collides in a task's physics."""
+    m, bodies = task.compiled, np.array(task.objects)
+    own = np.isin(m.geom_bodyid, bodies) & (m.geom_contype + m.geom_conaffinity > 0)
+    kinds = set(m.geom_type[own].tolist())
+    if mujoco.mjtGeom.mjGEOM_SPHERE not in kinds:
+        return "shapes"
+    assert task.model.geometry is not None
+    return "spheres" if own.sum() == len(task.model.geometry) else "events"
 
 
 def test_interruption_keeps_what_was_learnt(made, tmp_path):

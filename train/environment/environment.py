@@ -93,7 +93,8 @@ class Environment(VecEnv):
             self._seen_pairs = self._pairs
             if self.estimate is not None:
                 self._seen_pairs = self._contact_pairs(self.estimate.kinematics.poses(), stage, observation)
-            self._virtual = virtual_collision(task, physics, stage, cfg.virtual) if cfg.collision == "vcp" else None
+            penalised = cfg.collision == "vcp" or cfg.virtual.points
+            self._virtual = virtual_collision(task, physics, stage, cfg.virtual) if penalised else None
             self._measure()
             capture = cfg.capture != "none"
             self._measured = Graph(self._measure, warp_device, capture)

@@ -80,8 +80,8 @@ Report = Callable[[Iteration], None]
 Examination = Callable[[Callable[[TensorDict], torch.Tensor]], tuple[int, int]]
 """Given a policy without exploration, returns the numbers of successes and of episodes."""
 MakeExamination = Callable[[], Examination]
-MakeEnvironment = Callable[[tuple[int, int] | None], TrainingEnvironment]
-"""Makes the environment anew with room for so many contacts and constraint rows a world, by default as at first."""
+MakeEnvironment = Callable[[tuple[int, int] | None, bool], TrainingEnvironment]
+"""Makes the environment anew, with room for so many contacts and constraint rows, in the last iterations' physics."""
 
 
 class Trainer:
@@ -103,7 +103,7 @@ class Trainer:
             cfg: Settings; their `environment` is not read.
             folder: Run folder for checkpoints and metrics; None writes none.
             process: This process of a data-parallel training, within its group; a single process by default.
-            make_environment: Makes the environment with larger buffers when they overflow; by default they stay.
+            make_environment: Makes it with larger buffers when they overflow, and for the last iterations.
             make_examination: Makes the examination by which the best policy is kept; none by default.
         """
         self.environment, self.cfg, self.folder = environment, cfg, folder
@@ -118,7 +118,8 @@ class Trainer:
             seed_everything(self.process.seed(cfg.seed))
         self.iteration, self.steps, self.seconds = 0, 0, 0.0
         self.history: list[Iteration] = []
-        self._has_diverged = False
+        self._has_diverged = self._finishing = False
+        self._grown: tuple[int, int] | None = None
         self.best: dict[str, Any] = {}
         """The policy that did best in an examination: its weights "actor_state_dict", the "iteration", "successes" and
         "episodes"; empty before the first examination."""
@@ -142,6 +143,7 @@ class Trainer:
         with self._writer() as write, self.process.watch_interrupts() as interrupted:
             try:
                 while self.iteration < self.cfg.ppo.iterations:
+                    self._begin_finish()
                     last, observations = self._iterate(observations)
                     self._keep_best(last)
                     write(last)
@@ -161,6 +163,12 @@ class Trainer:
                 raise
             self.save()
         return last
+
+    def _begin_finish(self) -> None:
+        """Go on in the physics of the last iterations where these begin."""
+        if not self._finishing and self._make_environment is not None and self.iteration >= self.cfg.finish_from:
+            with self.process.raise_together():
+                self._rebuild(self._grown, finishing=True)
 
     def _keep_best(self, this: Iteration) -> None:
         """Examine the policy where it is due, note the result in the log, and keep the policy if it is the best.
@@ -209,11 +217,10 @@ class Trainer:
         collected = time.monotonic()
         losses = self._update()
         end = time.monotonic()
-        means = self._averaged(losses)
         self.iteration += 1
         self.steps += self.steps_per_iteration
         self.seconds += end - start
-        log |= {f"loss {name}": value for name, value in means.items()}
+        log |= {f"loss {name}": value for name, value in self._averaged(losses).items()}
         log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.detach().mean())}
         rate = self.steps_per_iteration / (end - start)
         this = Iteration(self.iteration, self.steps, self.seconds, collected - start, end - collected, rate, log)
@@ -287,11 +294,12 @@ class Trainer:
         larger = 2 * buffers[0], 2 * buffers[1]
         try:
             with self.process.raise_together():
-                self._rebuild(larger)
+                self._rebuild(larger, finishing=self._finishing)
         except TrainError as error:
             raise TrainError(
                 f"{text}, and larger buffers do not fit the memory", found=error, fix="lower --worlds"
             ) from None
+        self._grown = larger
         self._warn(
             f"{text}: the training goes on with room for {larger[0]} contacts and {larger[1]} constraints a world"
         )
@@ -301,8 +309,8 @@ class Trainer:
         if self.process.is_rank_zero:
             warnings.warn(text, stacklevel=2)
 
-    def _rebuild(self, buffers: tuple[int, int]) -> None:
-        """Make the environment anew with other buffers, in the same state; the old one is freed before.
+    def _rebuild(self, buffers: tuple[int, int] | None, *, finishing: bool) -> None:
+        """Make the environment anew with other buffers or physics, in the same state; the old one is freed before.
 
         Raises:
             TrainError: It does not fit the memory.
@@ -311,7 +319,7 @@ class Trainer:
         random, state = random_state(self.device), self.environment.state()
         del self.environment
         gc.collect()
-        self.environment = self._make_environment(buffers)
+        self.environment, self._finishing = self._make_environment(buffers, finishing), finishing
         self.environment.restore(state)
         restore_random_state(random, self.device)
 
@@ -367,7 +375,7 @@ class Trainer:
 
         Raises:
             TrainError: The checkpoint's network has another architecture, it has another number of ranks, it holds a
-                policy alone, or its parts do not belong to this training.
+                policy alone, or its parts are of another training.
         """
         document = load_checkpoint(path)
         if "ranks" not in document:
@@ -405,10 +413,14 @@ class Trainer:
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
         self.best = chosen_best(document)
         buffers = document.get("buffers")
-        if self._make_environment is not None and buffers is not None and buffers != self.environment.buffers:
+        if buffers is not None:
             contacts, constraints = buffers
             check_at_least(1, TrainError, contacts=contacts, constraints=constraints)
-            self._rebuild((int(contacts), int(constraints)))
+            buffers = int(contacts), int(constraints)
+        finishing = self.iteration > self.cfg.finish_from
+        if self._make_environment is not None and (finishing or buffers not in (None, self.environment.buffers)):
+            self._grown = buffers
+            self._rebuild(buffers, finishing=finishing)
         self.environment.restore(state["environment"])
         restore_random_state(state["random"], self.device)
 

@@ -98,6 +98,7 @@ def stressed(cfg: EnvironmentCfg, stress: StressCfg) -> EnvironmentCfg:
     return replace(
         cfg,
         collision="full",
+        virtual=replace(cfg.virtual, points=0),
         cone="elliptic",
         stride=1,
         nconmax=None,  # what was enough for fewer spheres
