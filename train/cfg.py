@@ -457,7 +457,8 @@ class TrainCfg:
             return TrainCfg(environment=EnvironmentCfg(stage=stage))
         action, reset = ActionCfg(turn=0.012), ResetCfg(states=4096, free=0.2)
         environment = EnvironmentCfg(stage=ALL, worlds=8192, cone="pyramidal", action=action, reset=reset)
-        return TrainCfg(environment=environment, ppo=PpoCfg(iterations=334, entropy=0.005))
+        ppo = PpoCfg(iterations=334, entropy=0.005)
+        return TrainCfg(environment=environment, ppo=ppo, finish=FinishCfg(share=0.0))
 
     def save(self, path: Path) -> None:
         """Write a TOML file atomically; None values are left out."""
