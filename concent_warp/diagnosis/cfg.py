@@ -63,7 +63,8 @@ class SearchCfg:
     Empirical."""
     impact_error: Share = 0.02
     """Error of velocities after an impact, over their change [-], that a second search allows for where the first does
-    not explain the data, see `concent_warp.fit.effects.impacts`; 0 for none. Empirical."""
+    not explain the data, or errors of impacts may stand behind what it found, see `concent_warp.fit.effects.impacts`; 0
+    for none. Empirical."""
     max_state_offset: float = 1.0
     """Largest fitted error of an initial state, in units of its standard deviation, up to which sensitivities are taken
     at the fitted states alone and not at the measured ones too: 1 sigma."""

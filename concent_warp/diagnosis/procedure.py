@@ -25,7 +25,7 @@ from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.replayed import Replayed, replayed
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio
 from concent_warp.diagnosis.search.alternatives import try_alternatives
 from concent_warp.diagnosis.search.context import (
     ADDITIONS_DONE,
@@ -35,6 +35,7 @@ from concent_warp.diagnosis.search.context import (
     SearchContext,
 )
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
+from concent_warp.diagnosis.search.impact_errors import stand
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
 from concent_warp.diagnosis.search.unknown_force import unknown_force
@@ -45,6 +46,7 @@ from concent_warp.fit.effects.fit import check_finite
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import channel_noises, has_touchable_free_body, observe
 from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.scatter import with_scatter
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.parallel import limit_simulations
@@ -112,43 +114,101 @@ class Procedure:
     ) -> tuple[FittedModel, list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given, the same and after each addition, and the detectable sizes of all effects.
 
-        Where these do not explain the data, the search is repeated with errors of impacts among the noise. What it
-        finds counts where it explains the data; the model as given is then fitted to windows with such errors, too.
+        Where these do not explain the data, or errors of impacts may stand behind them, the search is repeated with
+        such errors among the noise. What it finds counts where it explains the data; if the first answer explained
+        them, too, where it does so down to the noise by fewer effects. The model as given is then fitted to windows
+        with such errors.
         """
         context, begun = self.context, self.context.record.copy()
         fitted, detectable = self.search(given)
-        if context.explains(fitted[-1], given, added=bool(self.record.accepted())):
+        added = bool(self.record.accepted())
+        explained = context.explains(fitted[-1], given, added=added)
+        if (explained and not added) or context.budget.cut:
             return given, fitted, detectable
         left_open = "Open: what is missing where errors of impacts are allowed for."
-        rough = context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given), None, left_open)
+        rough = context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given, fitted), None, left_open)
         if rough is None:
+            return given, fitted, detectable
+        if explained and context.budget.attempt(lambda: self._stand(fitted, rough), True, left_open):
             return given, fitted, detectable
         budget, settled = context.budget, context.record
         cut, unsettled = budget.cut, budget.unsettled
         context.record, budget.cut, budget.unsettled = begun, set(), []
-        beside, smallest = self._added([rough], rough, ())
-        if self.record.accepted() and not budget.cut and context.explains(beside[-1], rough, added=True):
+        beside, smallest = self.search(rough)
+        count = len(self.record.accepted())
+        enough = context.explains(beside[-1], rough, added=count > 0)
+        if explained:
+            ratio = least_ratio(beside[-1], context.noise_factors)
+            enough &= count < len(settled.accepted()) and ratio <= context.cfg.search.explained_ratio
+        if enough and not budget.cut:
             self.impacts_left = True
             return rough, beside, smallest
         context.record, budget.cut, budget.unsettled = settled, cut, unsettled
         return given, fitted, detectable
 
-    def baseline_with_errors_of_impacts(self, given: FittedModel) -> FittedModel | None:
-        """Return the model as given where errors of impacts count as noise; None where that leaves nothing to explain.
+    def _stand(self, fitted: Sequence[FittedModel], rough: FittedModel) -> bool:
+        """Return whether the effects that were added stand beside errors of impacts.
 
-        It is None, too, where the model as given explains the data, is far off, or has no impacts.
+        A single one that leaves no more than noise stands, unless it is one of objects, which act through their
+        contacts as laws of these do. Several do not where one is of objects, or where they leave more than noise: each
+        was chosen beside the others, and then all may be wrong.
+
+        Args:
+            fitted: The model as given and after each addition.
+            rough: The model as given where errors of impacts count as noise.
         """
-        cfg, factors = self.context.cfg, self.context.noise_factors
-        error = cfg.search.impact_error
+        context, accepted = self.context, self.record.accepted()
+        near_noise = least_ratio(fitted[-1], context.noise_factors) <= context.cfg.search.explained_ratio
+        plain = near_noise and all(f.family != "objects" for f in accepted)
+        if len(accepted) == 1 and plain:
+            return True
+        if len(accepted) > 1 and not plain:
+            return False
+        context.progress("refitting the effects beside errors of impacts")
+        refitted = self._refitted(fitted[-1].model, rough.windows)
+        return all(stand(rough, refitted, len(accepted), context.noise_factors, context.cfg))
+
+    def baseline_with_errors_of_impacts(self, given: FittedModel, fitted: Sequence[FittedModel]) -> FittedModel | None:
+        """Return the model as given where errors of impacts count as noise; None where there are no impacts.
+
+        It is None, too, where the model is far off and nothing was found to follow the motion by.
+
+        Args:
+            given: The model as given.
+            fitted: The same and after each addition.
+        """
+        cfg = self.context.cfg
+        observation = replace(cfg.fits.observation, impact_error=cfg.search.impact_error)
         free = has_touchable_free_body(self.model.compile())
-        if not (error and free) or given.noise_ratio > cfg.search.far_ratio or not is_lacking(given, factors, cfg):
+        if not (observation.impact_error and free) or len(fitted[-1].windows) != len(given.windows):
             return None
-        windows = self._windows(given.model, cfg.window, error)
-        more = [_directions(a) > _directions(b) for a, b in zip(windows, given.windows, strict=True)]
-        if not any(more):
+        followed = self._followed(given, fitted[-1])
+        if given.noise_ratio > cfg.search.far_ratio and all(one is given for one in followed):
             return None
-        found = self._refitted(given.model, windows)
-        return found if is_lacking(found, factors, cfg) else None
+        found = []
+        for one in followed:
+            begun = [offset * w.spread for offset, w in zip(one.fit.offsets, given.windows, strict=True)]
+            windows = with_scatter(one.model, given.windows, self.engine, observation, begun)
+            more = [_directions(a) > _directions(b) for a, b in zip(windows, given.windows, strict=True)]
+            if any(more):
+                found.append(self._refitted(given.model, windows))
+        return min(found, key=lambda one: one.ratio, default=None)
+
+    def _followed(self, given: FittedModel, last: FittedModel) -> list[FittedModel]:
+        """Return the models whose impacts may be those that were measured.
+
+        One has the effects that were added; the other one not those of objects, which may stand for errors of impacts.
+
+        Args:
+            given: The model as given.
+            last: The same with all additions.
+        """
+        accepted, effects = self.record.accepted(), list(last.model.effects)
+        owned = len(effects) - len(accepted)
+        kept = [added for k, added in enumerate(effects[owned:]) if accepted[k].family != "objects"]
+        if not kept or len(kept) == len(accepted):
+            return [given, last] if accepted and not kept else [last if accepted else given]
+        return [self._refitted(replace(last.model, effects=(*effects[:owned], *kept)), given.windows), last]
 
     def search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given and after each addition, and the detectable sizes of all effects."""
@@ -251,18 +311,9 @@ class Procedure:
         self.noise_scale = found.noise_ratio / search.contact_ratio
         return self._refitted(self.model, self._windows(self.model, cfg.window))
 
-    def _windows(self, model: Model, length: float | None, impact_error: float | None = None) -> Sequence[Window]:
-        """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None.
-
-        Args:
-            model: The model.
-            length: The length [s].
-            impact_error: See `ObservationCfg.impact_error`; by default as there.
-        """
+    def _windows(self, model: Model, length: float | None) -> Sequence[Window]:
+        """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None."""
         cfg = self.context.cfg
-        observation = cfg.fits.observation
-        if impact_error is not None:
-            observation = replace(observation, impact_error=impact_error)
         windows = observe(
             model,
             self.recording,
@@ -270,7 +321,7 @@ class Procedure:
             noise={channel: self.noise_scale * std for channel, std in self.noise.items()},
             engine=self.engine,
             seed=cfg.seed,
-            cfg=observation,
+            cfg=cfg.fits.observation,
         )
         return [replace(w, noise_scale=self.noise_scale) for w in windows]
 

@@ -68,6 +68,27 @@ def thrown(drag: float, error: float, seed: int) -> Demonstration:
     return Demonstration(f"throw_{seed}", measured=seen)
 
 
+def dropped(restitution: float, seed: int) -> Demonstration:
+    """Return a throw that rebounds at once, by Newton's law, of which the position is tracked.
+
+    Args:
+        restitution: Speed after over speed before an impact [-].
+        seed: Of the throw and of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    time, g = np.arange(round(0.6 * RATE)) / RATE, 9.81
+    height, up, begun = rng.uniform(0.15, 0.4), rng.uniform(-0.3, 0.5), 0.0
+    z = np.empty(len(time))
+    while begun <= time[-1]:
+        t = time - begun
+        z[t >= 0] = (height + up * t - g * t**2 / 2)[t >= 0]
+        speed = float(np.sqrt(up**2 + 2 * g * height))
+        begun, height, up = begun + (up + speed) / g, 0.0, restitution * speed
+    x, y = (rng.uniform(-0.2, 0.2) + rng.uniform(-1, 1) * time for _ in range(2))
+    place = np.stack([x, y, RADIUS + z], axis=1) + NOISE * rng.normal(size=(len(time), 3))
+    return Demonstration(f"throw_{seed}", measured={"place": Channel(time, place, NOISE)})
+
+
 @cache
 def throws(drag: float, error: float) -> Recording:
     return Recording(SCENE, tuple(thrown(drag, error, seed) for seed in range(5)))
@@ -93,3 +114,13 @@ def test_rebounds_that_are_as_the_model_has_them_need_no_allowance():
     assert found.verdict == "effect"
     assert [f.name for f in found.accepted] == ["air_drag"]
     assert not any("impacts" in sentence for sentence in found.issues)
+
+
+def test_rebounds_of_a_rigid_contact_are_no_effect_of_anything_else():
+    # The simulated contact of the model lasts 8 ms: with it a ball seems to rebound from a floor that lies higher.
+    scene = SCENE.replace('<framequat name="orientation" objtype="body" objname="ball"/>', "")
+    scene = scene.replace("-40000 -20", "-160000 -56").replace('friction="0.3"', 'condim="1"')
+    recording = Recording(scene, tuple(dropped(0.8, seed) for seed in range(4)))
+    found = diagnosed(recording, ("frame_offset", "size", "wind"))
+    assert (found.verdict, [f.name for f in found.accepted]) == ("none_needed", [])
+    assert any("impacts" in sentence for sentence in found.issues)

@@ -93,6 +93,9 @@ class ObservationCfg:
     impact_error: Share = 0.0
     """Standard deviation of each component of the velocity after an impact that no contact law foretells, over the
     change of the velocity [-], see `impact_deviations`; 0 for none."""
+    impact_duration_error: Annotated[float, Bounds(0)] = 1.0
+    """Standard deviation of the time for which bodies touch in an impact after which they fly, over that in the
+    simulation [-]: a rigid contact is one of them away; nothing where `impact_error` is 0."""
     impact_flight: PositiveDuration = 0.02
     """Time that a body has flown before an impact [s]; shorter hops are the chatter of a contact."""
     impact_duration: PositiveDuration = 0.02

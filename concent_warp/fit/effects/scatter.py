@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 
 
 def with_scatter(
-    model: Model, windows: Sequence[Window], engine: EngineName = "mujoco", cfg: ObservationCfg | None = None
+    model: Model,
+    windows: Sequence[Window],
+    engine: EngineName = "mujoco",
+    cfg: ObservationCfg | None = None,
+    offsets: Sequence[np.ndarray] | None = None,
 ) -> list[Window]:
     """Return windows with the numerical scatter of a model's predictions from their initial states.
 
@@ -40,18 +44,21 @@ def with_scatter(
         windows: The windows.
         engine: Which engine simulates.
         cfg: Settings.
+        offsets: Errors of the initial states, each (2 nv,); none by default.
     """
     cfg = cfg or ObservationCfg()
     if not cfg.scatter_samples:
         return list(windows)
     prediction = Prediction(model, (), [replace(w, scatter=None) for w in windows], engine=engine)
     rough = [k for k, w in enumerate(windows) if not w.smooth and touches(model, w, engine)]
-    trials = {k: _shifted(prediction, k, cfg) for k in rough}
+    starts = [None] * len(windows) if offsets is None else list(offsets)
+    trials = {k: _shifted(prediction, k, cfg, starts[k]) for k in rough}
     courses = iter(prediction.courses([trial for k in rough for trial in trials[k]]))
     found = list(windows)
     for k in rough:
         seen = np.array([prediction.observed(k, next(courses).reader, trial.values) for trial in trials[k]])
-        found[k] = replace(found[k], scatter=_scatter(seen, impact_deviations(prediction, k, cfg), prediction, cfg))
+        by_impacts = impact_deviations(prediction, k, cfg, starts[k])
+        found[k] = replace(found[k], scatter=_scatter(seen, by_impacts, prediction, cfg))
     return found
 
 
@@ -70,12 +77,14 @@ def touches(model: Model, w: Window, engine: EngineName) -> bool | None:
     return bool(rollout.diverged.any() or rollout.touched.any())
 
 
-def _shifted(prediction: Prediction, window: int, cfg: ObservationCfg) -> list[SimulationRequest]:
+def _shifted(
+    prediction: Prediction, window: int, cfg: ObservationCfg, begun: np.ndarray | None
+) -> list[SimulationRequest]:
     """Return simulations of a window that begin within a time step before it, on the way to its initial state."""
     w, values, count = prediction.windows[window], prediction.start, cfg.scatter_samples
     m = prediction.compiled
     step = m.opt.timestep
-    (course,) = prediction.courses([SimulationRequest(window, values)], 2 * step)
+    (course,) = prediction.courses([SimulationRequest(window, values, begun)], 2 * step)
     acceleration = np.nan_to_num((course.qvel[1] - course.qvel[0]) / step, posinf=0.0, neginf=0.0)
     # What presses bodies apart that overlap at the start, by an error of their measured poses, says nothing about them.
     acceleration[_touching_dofs(m, course.qpos[0])] = 0.0
@@ -84,6 +93,7 @@ def _shifted(prediction: Prediction, window: int, cfg: ObservationCfg) -> list[S
         early = k / count * step
         offset = cfg.scatter_offset * w.spread * rng.normal(size=2 * m.nv)
         offset -= early * np.concatenate([course.qvel[0], acceleration])
+        offset += 0.0 if begun is None else begun
         found.append(SimulationRequest(window, values, offset, early))
     return found
 

@@ -96,7 +96,7 @@ def test_bodies_at_rest_in_flight_or_that_hop_a_little_have_none():
 def test_what_follows_an_impact_is_uncertain_by_its_velocity_times_time_and_nothing_before_it():
     prediction = prediction_of(0.3)
     (window,), (impact,) = prediction.windows, impacts_of(prediction)
-    found = impact_deviations(prediction, 0, CFG)
+    found = impact_deviations(prediction, 0, replace(CFG, impact_duration_error=0.0))
     assert found.shape == (window.count, 6)
     begun = impact.step * STEP
     assert np.abs(found[~late(window, begun)]).max() == 0.0
@@ -107,6 +107,29 @@ def test_what_follows_an_impact_is_uncertain_by_its_velocity_times_time_and_noth
         np.testing.assert_allclose(np.abs(moved[:, axis]), impact.std[axis] * since / NOISE, atol=0.02 * moved.max())
     # A ball that flies is where it is however it turns.
     assert np.abs(found[:, 3:]).max() < 1e-3 * np.abs(found[:, :3]).max()
+
+
+def test_a_ball_may_have_left_its_impact_at_once_and_what_is_seen_meanwhile_says_little():
+    prediction = prediction_of(0.3)
+    (window,), (impact,) = prediction.windows, impacts_of(prediction)
+    found = impact_deviations(prediction, 0, CFG)[:, 6:]
+    begun, over = impact.begin * STEP, impact.step * STEP
+    assert impact.flies
+    assert begun == pytest.approx(IMPACT, abs=2 * STEP)
+    assert np.abs(found[~late(window, begun)]).max() == 0.0
+    (course,) = prediction.courses([SimulationRequest(0, prediction.start)])
+    rebound = course.qvel[impact.step, 2]
+    after = late(window, over)
+    ahead = -found[after][2::3, 0] * NOISE  # residuals are what was measured less what is predicted
+    # Without a duration the ball is ahead by its way in that time.
+    speed = rebound - GRAVITY * (window.clock[after][2::3] - over)
+    np.testing.assert_allclose(ahead, speed * (over - begun), rtol=0.1)
+    # A reading in the impact is uncertain by itself.
+    during = late(window, begun) & ~after
+    assert found.shape[1] - 1 == during[2::3].sum() > 0
+    for column in found[:, 1:].T:
+        assert np.count_nonzero(column) == 1
+        assert column[during].any()
 
 
 def test_a_rebound_that_is_wrong_by_half_a_percent_is_no_more_than_noise_and_by_a_tenth_it_is():
