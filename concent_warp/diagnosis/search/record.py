@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.result import Finding, FinerTimeStep
+from concent_warp.diagnosis.result import Finding, FinerTimeStep, HoldingFriction
 from concent_warp.diagnosis.search.reconsider import Rival
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
@@ -34,6 +34,10 @@ class SearchRecord:
     equals: dict[int, dict[str, Model]] = field(default_factory=dict)
     """Effects of other answers that the data cannot distinguish from this one, in the place of each addition."""
     time_step: FinerTimeStep | None = None
+    holding: tuple[HoldingFriction, ...] = ()
+    """Where dry friction holds by other constants than the model has as given."""
+    held_first: int = 0
+    """How many of these hold in the model that effects are added to."""
     nominal_values: tuple[FittedParameter, ...] = ()
     provisional: int | None = None
     """Index of an addition that stays only if it makes an earlier one superfluous, or explains nearly all that was

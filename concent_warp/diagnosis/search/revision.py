@@ -17,6 +17,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
+from concent_warp.diagnosis.search.holding import with_constants
 from concent_warp.diagnosis.search.joint_fit import (
     established_effects,
     joint_finding,
@@ -28,6 +29,7 @@ from concent_warp.diagnosis.search.nominal_values import nominal_effects, nomina
 from concent_warp.diagnosis.search.reconsider import reconsider
 from concent_warp.diagnosis.search.time_step import at_given_step, renew_defects
 from concent_warp.diagnosis.time_budget import PROFILE_SHARE, TOGETHER_SHARE
+from concent_warp.scene.scene import Scene
 
 
 class Revision:
@@ -134,15 +136,20 @@ class Revision:
         found = self.context.nominal(reduced)
         return reduced if found is None else found
 
-    def restore_given(self, fitted: list[FittedModel], given: FittedModel) -> list[FittedModel]:
-        """Return the fitted models, the last with time step and nominal values as given where others explain no more.
+    def restore_given(self, fitted: list[FittedModel], given: FittedModel, scene: Scene) -> list[FittedModel]:
+        """Return the fitted models, the last with constants and nominal values as given where others explain no more.
 
         Effects that were added later may have made them superfluous. Where the model as given leaves no more than noise
         and no effect was accepted, it stays as given.
+
+        Args:
+            fitted: The fitted models.
+            given: The model that effects were added to.
+            scene: The scene as given.
         """
         context, record = self.context, self.context.record
         if not record.accepted() and not self._is_lacking(given):
-            record.time_step = None
+            record.time_step, record.holding = None, record.holding[: record.held_first]
             return [given]
         last, sentence = fitted[-1], "Open: whether {} beside the effects."
         if record.time_step is not None:
@@ -150,6 +157,12 @@ class Revision:
             refit = partial(at_given_step, last)
             restored = self._if_as_good(last, refit, sentence.format("a shorter time step is needed"))
             record.time_step = None if restored is not last else record.time_step
+            last = restored
+        if record.holding:
+            context.progress("restoring the constants of friction")
+            refit = partial(with_constants, last, scene)
+            restored = self._if_as_good(last, refit, sentence.format("friction that holds is needed"))
+            record.holding = () if restored is not last else record.holding
             last = restored
         if nominal_effects(last.model):
             context.progress("restoring nominal values")
@@ -284,6 +297,7 @@ def _gain_over(reduced: FittedModel, last: FittedModel) -> float:
 
 
 def _is_other(fitted: Sequence[FittedModel]) -> bool:
-    """Return whether the last of some fitted models has another time step, or other nominal values, than the first."""
+    """Return whether the last of some fitted models has other constants, or nominal values, than the first."""
     first, last = fitted[0], fitted[-1]
-    return first.timestep != last.timestep or len(nominal_effects(first.model)) != len(nominal_effects(last.model))
+    constants = first.timestep != last.timestep or first.model.scene.xml != last.model.scene.xml
+    return constants or len(nominal_effects(first.model)) != len(nominal_effects(last.model))
