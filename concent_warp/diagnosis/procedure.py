@@ -70,6 +70,8 @@ class Procedure:
         """See `Window.noise_scale`."""
         self.impacts_left = False
         """Whether errors of impacts are what the answer leaves."""
+        self.held: FittedModel | None = None
+        """The model that effects are added to where its friction holds and that of the model as given does not."""
         channels = {c for d in recording.demonstrations for c in d.measured}
         gradient = GradientStarts(model, recording) if cfg.gradient else None
         self.context = SearchContext(cfg, runner or TaskRunner(cfg.jobs))
@@ -101,12 +103,15 @@ class Procedure:
             start = self.additions.with_holding(given)
             context.record.held_first = len(context.record.holding)
             begun, fitted, detectable = self.search_beside_impacts(start)
-        given = begun if start is given else given
+        if start is given:
+            given = begun
+        else:
+            self.held = begun
         revision = self.revision
         runner.enter(ADDITIONS_DONE, REVISION_DONE)
-        fitted = revision.restore_given(revision.simplified(fitted), begun, self.model.scene)
+        fitted = revision.restore_given(revision.simplified(fitted), given)
         fitted = revision.final_values(revision.profiled(fitted))
-        found = self.conclude(given, begun, fitted, detectable, issues)
+        found = self.conclude(given, fitted, detectable, issues)
         runner.progress(1.0, "done")
         return found
 
@@ -280,7 +285,6 @@ class Procedure:
     def conclude(
         self,
         given: FittedModel,
-        begun: FittedModel,
         fitted: Sequence[FittedModel],
         detectable: tuple[Detectable, ...],
         issues: Sequence[str],
@@ -289,11 +293,11 @@ class Procedure:
 
         Args:
             given: The model as given.
-            begun: The same, with friction that holds where that explains more: what effects were added to.
             fitted: The same, with a shorter time step where that explains more, and after each addition or removal.
             detectable: Smallest detectable sizes.
             issues: Sentences on the data.
         """
+        begun = self.held or given
         context, record, last = self.context, self.record, fitted[-1]
         cfg, budget = context.cfg, context.budget
         left, lacked = discrepancies(last, begun)

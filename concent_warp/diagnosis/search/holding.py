@@ -39,7 +39,7 @@ def hold(
     return base, found
 
 
-def with_constants(last: FittedModel, scene: Scene) -> FittedModel:
+def with_scene(last: FittedModel, scene: Scene) -> FittedModel:
     """Return a fitted model with another scene, all parameters fitted again."""
     return refitted(replace(last, model=replace(last.model, scene=scene)))
 

@@ -34,10 +34,6 @@ class SearchRecord:
     equals: dict[int, dict[str, Model]] = field(default_factory=dict)
     """Effects of other answers that the data cannot distinguish from this one, in the place of each addition."""
     time_step: FinerTimeStep | None = None
-    holding: tuple[HoldingFriction, ...] = ()
-    """Where dry friction holds by other constants than the model has as given."""
-    held_first: int = 0
-    """How many of these hold in the model that effects are added to."""
     nominal_values: tuple[FittedParameter, ...] = ()
     provisional: int | None = None
     """Index of an addition that stays only if it makes an earlier one superfluous, or explains nearly all that was
@@ -48,6 +44,10 @@ class SearchRecord:
     """The fitted models with all effects, where some are removed that are not established."""
     part_refused: bool = False
     """Whether the last search for an effect found some, and none that explains enough of the little that was left."""
+    holding: tuple[HoldingFriction, ...] = ()
+    """Where dry friction holds by other constants than the model has as given."""
+    held_first: int = 0
+    """How many of these hold in the model that effects are added to."""
 
     def copy(self) -> SearchRecord:
         """Return a copy that does not change with this one."""

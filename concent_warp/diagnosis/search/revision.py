@@ -17,7 +17,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
-from concent_warp.diagnosis.search.holding import with_constants
+from concent_warp.diagnosis.search.holding import with_scene
 from concent_warp.diagnosis.search.joint_fit import (
     established_effects,
     joint_finding,
@@ -29,7 +29,6 @@ from concent_warp.diagnosis.search.nominal_values import nominal_effects, nomina
 from concent_warp.diagnosis.search.reconsider import reconsider
 from concent_warp.diagnosis.search.time_step import at_given_step, renew_defects
 from concent_warp.diagnosis.time_budget import PROFILE_SHARE, TOGETHER_SHARE
-from concent_warp.scene.scene import Scene
 
 
 class Revision:
@@ -136,20 +135,15 @@ class Revision:
         found = self.context.nominal(reduced)
         return reduced if found is None else found
 
-    def restore_given(self, fitted: list[FittedModel], given: FittedModel, scene: Scene) -> list[FittedModel]:
+    def restore_given(self, fitted: list[FittedModel], given: FittedModel) -> list[FittedModel]:
         """Return the fitted models, the last with constants and nominal values as given where others explain no more.
 
         Effects that were added later may have made them superfluous. Where the model as given leaves no more than noise
         and no effect was accepted, it stays as given.
-
-        Args:
-            fitted: The fitted models.
-            given: The model that effects were added to.
-            scene: The scene as given.
         """
         context, record = self.context, self.context.record
         if not record.accepted() and not self._is_lacking(given):
-            record.time_step, record.holding = None, record.holding[: record.held_first]
+            record.time_step, record.holding = None, ()
             return [given]
         last, sentence = fitted[-1], "Open: whether {} beside the effects."
         if record.time_step is not None:
@@ -160,7 +154,7 @@ class Revision:
             last = restored
         if record.holding:
             context.progress("restoring the constants of friction")
-            refit = partial(with_constants, last, scene)
+            refit = partial(with_scene, last, given.model.scene)
             restored = self._if_as_good(last, refit, sentence.format("friction that holds is needed"))
             record.holding = () if restored is not last else record.holding
             last = restored
