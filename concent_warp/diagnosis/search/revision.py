@@ -39,6 +39,8 @@ class Revision:
         self.context = context
         self.reduced: list[FittedModel] = []
         """The last fitted model without one of its effects each, as refitted when that was tried."""
+        self.hurried = False
+        """Whether there was no time for what errors of nominal values do to the intervals of the answer."""
 
     def simplified(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models without superfluous effects, and without one that takes up errors of formulas."""
@@ -231,6 +233,9 @@ class Revision:
         nominal = attempt(lambda: nominal_errors(last, context.cfg), None, unsettled, TOGETHER_SHARE)
         parameters, linear = (joint_parameters(last, by, nominal) for by in (widening, None))
         established = established_effects(last, linear, context.cfg.search.dependent_share, None, nominal)[owned:]
+        self.hurried = nominal is None
+        if self.hurried:  # errors of nominal values may be all that an effect beside another one stands for
+            established = [sure and not k for k, sure in enumerate(established)]
         record.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
             alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)
@@ -270,6 +275,8 @@ class Revision:
             reason = "its parameters may be at their null values beside the others"
             if len(accepted) == 1:
                 reason = "its parameters may be at their null values"
+            elif self.hurried:
+                reason = "there was no time to tell it from errors of nominal values"
             self.context.record.remove(f, reason)
             if len(accepted) > 1:
                 return [*fitted, reduced]

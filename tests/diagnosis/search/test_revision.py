@@ -382,6 +382,31 @@ def test_an_effect_that_may_be_at_its_null_values_is_removed_where_the_data_are_
         assert made.record.hypotheses == [h for h in ({"a": 1}, {"b": 2, "y": 3}, {"c": 4}) if removed not in h]
 
 
+def test_an_effect_beside_another_is_not_established_without_time_for_errors_of_nominal_values(monkeypatch):
+    def late(*_):
+        raise TimeUpError
+
+    for errors, sure in ((late, [True, False]), (lambda *_: "nominal", [True, True])):
+        made, last = procedure(), node(1.0, effects=2)
+        monkeypatch.setattr(made.revision, "_joint", lambda _, last=last: last)
+        monkeypatch.setattr(revision, "joint_parameters", lambda *_: [(CLEAR,), (CLEAR,)])
+        monkeypatch.setattr(revision, "established_effects", lambda *_: [True, True])
+        monkeypatch.setattr(revision, "nominal_errors", errors)
+        monkeypatch.setattr(revision, "refit_without_effect", lambda *_: node(1.2, effects=1))
+        monkeypatch.setattr(revision, "joint_finding", lambda f, *_: f)
+        monkeypatch.setattr(revision, "with_intervals", lambda last, *_: last)
+        monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+        made.record.findings = [finding(name, 0.5, step=k) for k, name in enumerate("ab")]
+        made.record.groups, made.record.hypotheses = [("a",), ("b",)], [{"a": 1}, {"b": 2}]
+        made.record.widening = {0: "wide", 1: "wide"}
+        fitted, without, established = made.revision._fitted_together([node(9), last])
+        assert established == sure
+        made.revision.remove_unestablished(fitted, without, established)
+        dropped = made.record.findings[1]
+        assert dropped.accepted is sure[1]
+        assert dropped.reason == ("" if sure[1] else "there was no time to tell it from errors of nominal values")
+
+
 def test_an_only_effect_that_may_be_at_its_null_value_leaves_the_model_as_given(monkeypatch):
     for ratio, nominal, left in ((1.2, None, "given"), (1.3, None, None), (1.3, 1.2, "nominal")):
         made, given, reduced = procedure(), node(ratio), node(ratio, 150.0)
