@@ -43,9 +43,7 @@ def driven(own: str = "", creeps: bool = False) -> Recording:
     wanted = command[np.minimum((np.arange(count) * STEP * 60 + 1e-9).astype(int), 239)]
     scene = Scene(STAGE.format(own=own))
     if creeps:
-        action = {"motor": Channel(time, command)}
-        rollout = cw.Model(scene)
-        position = simulated(rollout, wanted)
+        position = simulated(Model(scene), wanted)
     else:
         q, v, position = 0.0, 0.0, np.empty(count)
         for k, u in enumerate(wanted):
@@ -66,14 +64,12 @@ def simulated(model: Model, wanted: np.ndarray) -> np.ndarray:
 
     m = model.compile()
     d, every = mujoco.MjData(m), round(m.opt.timestep / STEP)
-    found = np.empty(len(wanted))
-    for k in range(len(wanted)):
-        if k % every == 0:
-            before = float(d.qpos[0])
-            d.ctrl[0] = wanted[k]
-            mujoco.mj_step(m, d)
-        found[k] = before + (float(d.qpos[0]) - before) * (k % every) / every
-    return found
+    at_steps = [0.0]
+    for u in wanted[::every]:
+        d.ctrl[0] = u
+        mujoco.mj_step(m, d)
+        at_steps.append(float(d.qpos[0]))
+    return np.interp(np.arange(len(wanted)) / every, np.arange(len(at_steps)), at_steps)
 
 
 def fitted(recording: Recording) -> FittedModel:
