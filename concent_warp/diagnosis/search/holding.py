@@ -14,7 +14,7 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.screening import robust_sum
-from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
 from concent_warp.diagnosis.result import HoldingFriction
 from concent_warp.diagnosis.search.time_step import explains_more, projected_residuals, refitted, renew_defects
 from concent_warp.fit.effects.cross_validation import bootstrap_interval
@@ -39,9 +39,9 @@ def hold(
     return base, found
 
 
-def with_scene(last: FittedModel, scene: Scene) -> FittedModel:
+def with_scene(last: FittedModel, scene: Scene, cfg: TimeStepCfg) -> FittedModel:
     """Return a fitted model with another scene, all parameters fitted again."""
-    return refitted(replace(last, model=replace(last.model, scene=scene)))
+    return renew_defects(refitted(replace(last, model=replace(last.model, scene=scene))), cfg)
 
 
 def _holding(base: FittedModel, where: Holding, cfg: DiagnoseCfg) -> FittedModel | None:

@@ -156,7 +156,7 @@ class Revision:
             last = restored
         if record.holding:
             context.progress("restoring the constants of friction")
-            refit = partial(with_scene, last, given.model.scene)
+            refit = partial(with_scene, last, given.model.scene, context.cfg.time_step)
             restored = self._if_as_good(last, refit, sentence.format("friction that holds is needed"))
             record.holding = () if restored is not last else record.holding
             last = restored

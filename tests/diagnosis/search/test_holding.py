@@ -94,7 +94,7 @@ def test_friction_that_holds_explains_more_where_the_stage_rests(held):
     np.testing.assert_allclose(found.model.scene.model.dof_solref, [[0.003, 1.0]])
     assert 'solreffriction="0.003 1"' in said[0].sentence
     assert hold(found, said, CFG) == (found, said)
-    assert with_scene(found, base.model.scene).errors.sum() == pytest.approx(base.errors.sum(), rel=0.02)
+    assert with_scene(found, base.model.scene, CFG.time_step).errors.sum() == pytest.approx(base.errors.sum(), rel=0.02)
 
 
 def test_friction_that_creeps_stays_where_the_data_creep_or_the_model_says_so(held):

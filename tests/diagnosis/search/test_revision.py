@@ -63,6 +63,17 @@ def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at
     assert plain.revision.restore_given(nodes, nodes[0]) == nodes
 
 
+def test_friction_as_given_is_restored_where_one_that_holds_explains_no_more_at_the_end(monkeypatch):
+    for errors, left in ((104.0, ()), (120.0, ("joints",))):
+        made, first, last = procedure(), node(3.0), node(1.0, 100.0, effects=1)
+        made.record.holding, made.record.findings = ("joints",), [finding("a", 0.5)]
+        asked = []
+        monkeypatch.setattr(revision, "with_scene", lambda *args, e=errors, a=asked: a.append(args) or node(1.0, e, 1))
+        after = made.revision.restore_given([first, last], first)
+        assert (after[-1] is last, made.record.holding) == (bool(left), left)
+        assert asked == [(last, first.model.scene, made.context.cfg.time_step)]
+
+
 def test_an_effect_beside_an_error_of_form_stays_if_it_explains_that_or_makes_another_superfluous(monkeypatch):
     # Errors of the model without the first effect; noise ratio with all three.
     # 15.4 % and 14.7 % of what was left beside the noise.
