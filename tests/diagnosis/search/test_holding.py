@@ -105,7 +105,7 @@ def test_friction_that_creeps_stays_where_the_data_creep_or_the_model_says_so(he
 
 
 def test_nothing_is_missing_from_a_stage_whose_friction_holds(held, tmp_path):
-    effects = ("backlash", "actuator_gain")  # of which the first is named without it
+    effects = ("backlash", "actuator_gain")  # none of these, where friction creeps
     found = cw.diagnose(Model(Scene(held.scene)), held, replace(CFG, effects=effects))
     assert (found.verdict, found.accepted) == ("none_needed", ())
     (said,) = found.to_json()["holding"]
