@@ -72,6 +72,8 @@ class Procedure:
         """See `Window.noise_scale`."""
         self.impacts_left = False
         """Whether errors of impacts are what the answer leaves."""
+        self.held: FittedModel | None = None
+        """The model that effects are added to where its friction holds and that of the model as given does not."""
         channels = {c for d in recording.demonstrations for c in d.measured}
         gradient = GradientStarts(model, recording) if cfg.gradient else None
         self.context = SearchContext(cfg, runner or TaskRunner(cfg.jobs))
@@ -100,7 +102,13 @@ class Procedure:
         given = self.baseline()
         runner.enter(BASELINE_DONE, ADDITIONS_DONE)
         with context.budget.until(SEARCH_SHARE):
-            given, fitted, detectable = self.search_beside_impacts(given)
+            start = self.additions.with_holding(given)
+            context.record.held_first = len(context.record.holding)
+            begun, fitted, detectable = self.search_beside_impacts(start)
+        if start is given:
+            given = begun
+        else:
+            self.held = begun
         revision = self.revision
         runner.enter(ADDITIONS_DONE, REVISION_DONE)
         fitted = revision.restore_given(revision.simplified(fitted), given)
@@ -340,20 +348,21 @@ class Procedure:
             detectable: Smallest detectable sizes.
             issues: Sentences on the data.
         """
+        begun = self.held or given
         context, record, last = self.context, self.record, fitted[-1]
         cfg, budget = context.cfg, context.budget
-        left, lacked = discrepancies(last, given)
+        left, lacked = discrepancies(last, begun)
         added = any(f.accepted for f in record.findings)
         share = float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0))
-        unexplained = share if added or given.ratio > cfg.adequate_ratio else 0.0
-        adequate, form_error = context.explains(last, given, added=added), None
-        if added and is_lacking(last, context.noise_factors, cfg) and context.is_form_error(last, given):
+        unexplained = share if added or begun.ratio > cfg.adequate_ratio else 0.0
+        adequate, form_error = context.explains(last, begun, added=added), None
+        if added and is_lacking(last, context.noise_factors, cfg) and context.is_form_error(last, begun):
             form_error = unexplained
         unknown = None
         if adequate and (added or record.part_refused):
             # What an effect explains with values that may be its null values needs no force of unknown form.
             tested = record.with_unestablished or fitted
-            nodes = [given, *(tested[1:] or tested)]
+            nodes = [begun, *(tested[1:] or tested)]
             context.runner.enter(VALUES_DONE, 1.0)
             context.progress("testing forces of no known form")
             unknown = budget.attempt(
@@ -401,6 +410,7 @@ class Procedure:
             remainder_searched=not budget.cut if named else None,
             replayed=alike,
             time_step=record.time_step,
+            holding=record.holding,
             nominal_values=record.nominal_values,
             unsettled=tuple(budget.unsettled),
             explains=verdict != "none_of_these" or unexplained <= 1 - cfg.min_explained,

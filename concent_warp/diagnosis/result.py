@@ -15,6 +15,7 @@ from concent_warp.diagnosis.result_html import diagnosis_html
 from concent_warp.effects.table import posteriors_table
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
+from concent_warp.scene.holding import Holding
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these", "unsettled"]
 VERDICTS: dict[Verdict, str] = {
@@ -137,6 +138,37 @@ class UnknownForceFound:
 
 
 @dataclass(frozen=True)
+class HoldingFriction:
+    """Dry friction that holds, by constants that the MJCF leaves at their defaults, before any effect."""
+
+    where: Holding
+    """Where it acts."""
+    settings: Mapping[str, str]
+    """The constants as attributes of the MJCF."""
+    gain: float
+    """Share of the held-out error that they remove [-]."""
+    low: float
+    """Lower end of the 95 % interval of the gain."""
+    high: float
+    """Upper end."""
+
+    @property
+    def sentence(self) -> str:
+        """A sentence on the friction."""
+        values = " and ".join(f'{name}="{value}"' for name, value in self.settings.items())
+        return (
+            f"The model's dry friction in {self.where} creeps, by default constants of the simulator: with {values} it "
+            f"holds, and the held-out error falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, "
+            f"{100 * self.high:.0f}]; the diagnosis uses it."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it in plain types."""
+        gain = {"value": self.gain, "interval": [self.low, self.high]}
+        return {"where": self.where, "settings": dict(self.settings), "gain": gain}
+
+
+@dataclass(frozen=True)
 class FinerTimeStep:
     """A shorter time step with which the model explains more, before any effect."""
 
@@ -226,6 +258,8 @@ class Diagnosis:
     it was not done."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
+    holding: tuple[HoldingFriction, ...] = ()
+    """Where the data ask for dry friction that holds, by other constants of the simulator than its defaults."""
     nominal_values: tuple[FittedParameter, ...] = ()
     """Masses, lengths, gains and latencies that the data ask for within their tolerance; factors but for latencies."""
     unsettled: tuple[str, ...] = ()
@@ -246,7 +280,9 @@ class Diagnosis:
     @property
     def changes_model(self) -> bool:
         """Whether `model` differs from the model as given by more than the values of its own parameters."""
-        return self.explains and (bool(self.accepted or self.nominal_values) or self.time_step is not None)
+        return self.explains and (
+            bool(self.accepted or self.nominal_values or self.holding) or self.time_step is not None
+        )
 
     @property
     def headline(self) -> str:
@@ -271,6 +307,7 @@ class Diagnosis:
             "remainder_searched": self.remainder_searched,
             "replayed": None if self.replayed is None else self.replayed.to_json(),
             "time_step": None if self.time_step is None else self.time_step.to_json(),
+            "holding": [h.to_json() for h in self.holding],
             "nominal_values": [_parameter(p) for p in self.nominal_values],
             "posterior": self._posterior(),
             "ratio": list(self.ratio),
@@ -359,7 +396,8 @@ class Diagnosis:
             said.append(self.unknown_force.sentence)
         if self.next_experiment:
             said.append(f"Next experiment: {self.next_experiment.sentence}")
-        numerical = [] if self.time_step is None else [self.time_step.sentence]
+        numerical = [h.sentence for h in self.holding]
+        numerical += [] if self.time_step is None else [self.time_step.sentence]
         if self.nominal_values:
             values = ", ".join(
                 f"{p.name} x {p.value:.3f} [{p.low:.3f}, {p.high:.3f}]"

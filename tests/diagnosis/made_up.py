@@ -38,7 +38,7 @@ def node(
     added = [
         SimpleNamespace(effect=SimpleNamespace(nominal=k < nominal, variables=())) for k in range(nominal + effects)
     ]
-    model = SimpleNamespace(effects=added, name=name)
+    model = SimpleNamespace(effects=added, name=name, scene=MODEL.scene)
     # Residuals of one size, beyond the limit of the robust loss nowhere.
     piece = SimpleNamespace(residual=np.full(4, float(ratio)))
     window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))], defect=None)

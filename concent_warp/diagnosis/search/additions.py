@@ -19,6 +19,7 @@ from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, le
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
+from concent_warp.diagnosis.search.holding import hold
 from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import finer_time_step, renew_defects
@@ -64,6 +65,8 @@ class Additions:
                     record.provisional = step
                 elif step > record.provisional:
                     break
+            if step and not effects_alone:
+                fitted[-1] = self.with_holding(fitted[-1])
             finer = None if effects_alone else self._finer(fitted[-1])
             if finer is not None and not is_lacking(finer, factors, cfg):
                 fitted = self._adopt(fitted, finer)
@@ -157,6 +160,19 @@ class Additions:
             return False
         left = correction.sum() / max(float(with_interleaved_folds(one).errors.sum()), 1e-12)
         return one.ratio * float(np.sqrt(left)) <= self.context.cfg.search.explained_ratio
+
+    def with_holding(self, one: FittedModel) -> FittedModel:
+        """Return a fitted model with dry friction that holds where that explains more, else that model."""
+        context = self.context
+        if not is_lacking(one, context.noise_factors, context.cfg):
+            return one
+        context.progress("holding by friction")
+        unsettled = "Open: whether friction that holds explains more."
+        found = context.budget.attempt(lambda: hold(one, context.record.holding, context.cfg), None, unsettled)
+        if found is None:
+            return one
+        held, context.record.holding = found
+        return held
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""

@@ -143,6 +143,8 @@ def _from(additions: Additions, first: FittedModel, rival: Rival) -> list[Fitted
         widening={0: np.ones(len(instead.parameters))},
         rivals={0: before.rivals[0]},
         time_step=None if first.windows[0].defect is None else before.time_step,
+        holding=before.holding[: before.held_first],
+        held_first=before.held_first,
     )
     return additions.add_effects([first, begun], ())[0]
 

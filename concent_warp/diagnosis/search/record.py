@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.result import Finding, FinerTimeStep
+from concent_warp.diagnosis.result import Finding, FinerTimeStep, HoldingFriction
 from concent_warp.diagnosis.search.reconsider import Rival
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
@@ -44,6 +44,10 @@ class SearchRecord:
     """The fitted models with all effects, where some are removed that are not established."""
     part_refused: bool = False
     """Whether the last search for an effect found some, and none that explains enough of the little that was left."""
+    holding: tuple[HoldingFriction, ...] = ()
+    """Where dry friction holds by other constants than the model has as given."""
+    held_first: int = 0
+    """How many of these hold in the model that effects are added to."""
 
     def copy(self) -> SearchRecord:
         """Return a copy that does not change with this one."""

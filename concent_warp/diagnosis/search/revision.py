@@ -17,6 +17,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
+from concent_warp.diagnosis.search.holding import with_scene
 from concent_warp.diagnosis.search.joint_fit import (
     established_effects,
     joint_finding,
@@ -38,6 +39,8 @@ class Revision:
         self.context = context
         self.reduced: list[FittedModel] = []
         """The last fitted model without one of its effects each, as refitted when that was tried."""
+        self.hurried = False
+        """Whether there was no time for what errors of nominal values do to the intervals of the answer."""
 
     def simplified(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models without superfluous effects, and without one that takes up errors of formulas."""
@@ -135,14 +138,14 @@ class Revision:
         return reduced if found is None else found
 
     def restore_given(self, fitted: list[FittedModel], given: FittedModel) -> list[FittedModel]:
-        """Return the fitted models, the last with time step and nominal values as given where others explain no more.
+        """Return the fitted models, the last with constants and nominal values as given where others explain no more.
 
         Effects that were added later may have made them superfluous. Where the model as given leaves no more than noise
         and no effect was accepted, it stays as given.
         """
         context, record = self.context, self.context.record
         if not record.accepted() and not self._is_lacking(given):
-            record.time_step = None
+            record.time_step, record.holding = None, ()
             return [given]
         last, sentence = fitted[-1], "Open: whether {} beside the effects."
         if record.time_step is not None:
@@ -150,6 +153,12 @@ class Revision:
             refit = partial(at_given_step, last)
             restored = self._if_as_good(last, refit, sentence.format("a shorter time step is needed"))
             record.time_step = None if restored is not last else record.time_step
+            last = restored
+        if record.holding:
+            context.progress("restoring the constants of friction")
+            refit = partial(with_scene, last, given.model.scene, context.cfg.time_step)
+            restored = self._if_as_good(last, refit, sentence.format("friction that holds is needed"))
+            record.holding = () if restored is not last else record.holding
             last = restored
         if nominal_effects(last.model):
             context.progress("restoring nominal values")
@@ -224,6 +233,9 @@ class Revision:
         nominal = attempt(lambda: nominal_errors(last, context.cfg), None, unsettled, TOGETHER_SHARE)
         parameters, linear = (joint_parameters(last, by, nominal) for by in (widening, None))
         established = established_effects(last, linear, context.cfg.search.dependent_share, None, nominal)[owned:]
+        self.hurried = nominal is None
+        if self.hurried:  # errors of nominal values may be all that an effect beside another one stands for
+            established = [sure and not k for k, sure in enumerate(established)]
         record.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
             alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)
@@ -263,6 +275,8 @@ class Revision:
             reason = "its parameters may be at their null values beside the others"
             if len(accepted) == 1:
                 reason = "its parameters may be at their null values"
+            elif self.hurried:
+                reason = "there was no time to tell it from errors of nominal values"
             self.context.record.remove(f, reason)
             if len(accepted) > 1:
                 return [*fitted, reduced]
@@ -284,6 +298,7 @@ def _gain_over(reduced: FittedModel, last: FittedModel) -> float:
 
 
 def _is_other(fitted: Sequence[FittedModel]) -> bool:
-    """Return whether the last of some fitted models has another time step, or other nominal values, than the first."""
+    """Return whether the last of some fitted models has other constants, or nominal values, than the first."""
     first, last = fitted[0], fitted[-1]
-    return first.timestep != last.timestep or len(nominal_effects(first.model)) != len(nominal_effects(last.model))
+    constants = first.timestep != last.timestep or first.model.scene.xml != last.model.scene.xml
+    return constants or len(nominal_effects(first.model)) != len(nominal_effects(last.model))

@@ -38,14 +38,14 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
         return None
     finer = _with_defects(base, base.model.scene.model.opt.timestep / division)
     before = robust_sum(base, [piece.residual for piece in base.pieces])
-    promised = 1 - robust_sum(base, _without_own(base, _projected(base, _residuals(finer)))) / max(before, 1e-12)
+    promised = 1 - robust_sum(base, projected_residuals(base, finer)) / max(before, 1e-12)
     if promised < cfg.search.min_expected_gain * cfg.min_gain:
         return None
-    found = renew_defects(_refitted(finer), cfg.time_step)
+    found = renew_defects(refitted(finer), cfg.time_step)
     if (begun := _at_states_of_shorter_step(found, cfg.time_step)) is not None:
-        again = renew_defects(_refitted(begun), cfg.time_step)
+        again = renew_defects(refitted(begun), cfg.time_step)
         found = min(found, again, key=lambda one: one.errors.sum())
-    return found if _explains_more(base, found, cfg) else None
+    return found if explains_more(base, found, cfg) else None
 
 
 def renew_defects(one: FittedModel, cfg: TimeStepCfg) -> FittedModel:
@@ -62,7 +62,7 @@ def renew_defects(one: FittedModel, cfg: TimeStepCfg) -> FittedModel:
             break
         renewed = _with_defects(one, one.timestep)
         change = [_defect(a) - _defect(b) for a, b in zip(renewed.windows, one.windows, strict=True)]
-        one = _refitted(renewed)
+        one = refitted(renewed)
         if noise_ratio(np.concatenate(change)) < cfg.max_error:
             break
     return one
@@ -137,7 +137,7 @@ def _with_defects(one: FittedModel, timestep: float) -> FittedModel:
     return replace(one, windows=tuple(replace(w, defect=TimeStepDefect(timestep, a - b)) for w, a, b in pairs))
 
 
-def _refitted(one: FittedModel) -> FittedModel:
+def refitted(one: FittedModel) -> FittedModel:
     """Return a model fitted again from where it is."""
     solver = one.solver()
     fit = solver.fit(one.fit.values, one.fit.offsets, one.fit.starts)
@@ -145,11 +145,21 @@ def _refitted(one: FittedModel) -> FittedModel:
     return fitted_model(solver.p.model(fit.values), one.windows, one.blocks, fit, one.engine, one.cfg)
 
 
-def _explains_more(base: FittedModel, finer: FittedModel, cfg: DiagnoseCfg) -> bool:
+def explains_more(base: FittedModel, finer: FittedModel, cfg: DiagnoseCfg) -> bool:
     """Return whether the held-out error falls by a relevant and significant share."""
     gain, rng = base.errors - finer.errors, np.random.default_rng(cfg.seed)
     relevant = gain.sum() >= cfg.min_gain * base.errors.sum()
     return bool(relevant and sign_flip_p(gain, rng) <= cfg.significance_level)
+
+
+def projected_residuals(base: FittedModel, other: FittedModel) -> list[np.ndarray]:
+    """Return the residuals of a model at a similar one's values, without what the latter's freedom takes up, each (n,).
+
+    Args:
+        base: The fitted model whose initial states and own parameters take up changes to first order.
+        other: The same with other constants, not fitted.
+    """
+    return _without_own(base, _projected(base, _residuals(other)))
 
 
 def _division(base: FittedModel, cfg: TimeStepCfg) -> int:

@@ -10,14 +10,11 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
 from concent_warp.effects.select import BEARINGS, SINGLE, dof_of, dofs_of, joints_by_type, typical_torque
+from concent_warp.scene.holding import FRICTION_IMPEDANCE, TIME_CONSTANT_STEPS
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
 
-TIME_CONSTANT_STEPS = 1.5
-"""Time constant of friction constraints in time steps [-]; with MuJoCo's default, joints at rest creep."""
-FRICTION_IMPEDANCE = 0.99
-"""Impedance of friction constraints [-]: with MuJoCo's default, 0.9, a joint at rest creeps visibly in stick-slip."""
 FRICTION_SCATTER = 0.03
 """Relative standard deviation of friction between repeated measurements [-]: several per cent, as it varies with place,
 time and temperature (joints: Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30(7), 1994; Bittencourt and

@@ -12,11 +12,11 @@ from tests.diagnosis.made_up import MODEL, finding
 
 
 def test_a_copy_of_a_record_has_all_of_it_and_does_not_change_with_it():
-    made_up: Any = ("rival",), "a shorter time step", ("value",), ["a model"], {0: ("a model", "a fit")}
-    rivals, time_step, values, models, unprofiled = made_up
+    made_up: Any = ("rival",), "a shorter time step", ("value",), ["a model"], {0: ("a model", "a fit")}, ("joints",)
+    rivals, time_step, values, models, unprofiled, holding = made_up
     record = SearchRecord(
         [finding("a", 0.5)], [("a",)], [{"a": MODEL}], {0: np.ones(1)}, unprofiled, {0: rivals},
-        {0: {"b": MODEL}}, time_step, values, 1, True, models, True,
+        {0: {"b": MODEL}}, time_step, values, 1, True, models, True, holding, 1,
     )  # fmt: skip
     assert all(getattr(record, f.name) for f in fields(SearchRecord))
     copied = record.copy()

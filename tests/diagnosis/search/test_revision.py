@@ -63,6 +63,17 @@ def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at
     assert plain.revision.restore_given(nodes, nodes[0]) == nodes
 
 
+def test_friction_as_given_is_restored_where_one_that_holds_explains_no_more_at_the_end(monkeypatch):
+    for errors, left in ((104.0, ()), (120.0, ("joints",))):
+        made, first, last = procedure(), node(3.0), node(1.0, 100.0, effects=1)
+        made.record.holding, made.record.findings = ("joints",), [finding("a", 0.5)]
+        asked = []
+        monkeypatch.setattr(revision, "with_scene", lambda *args, e=errors, a=asked: a.append(args) or node(1.0, e, 1))
+        after = made.revision.restore_given([first, last], first)
+        assert (after[-1] is last, made.record.holding) == (bool(left), left)
+        assert asked == [(last, first.model.scene, made.context.cfg.time_step)]
+
+
 def test_an_effect_beside_an_error_of_form_stays_if_it_explains_that_or_makes_another_superfluous(monkeypatch):
     # Errors of the model without the first effect; noise ratio with all three.
     # 15.4 % and 14.7 % of what was left beside the noise.
@@ -380,6 +391,31 @@ def test_an_effect_that_may_be_at_its_null_values_is_removed_where_the_data_are_
         assert [f.name for f in made.record.accepted()] == [name for name in "abc" if name != removed]
         assert made.record.groups == [g for g in (("a",), ("b", "y"), ("c",)) if g[0] != removed]
         assert made.record.hypotheses == [h for h in ({"a": 1}, {"b": 2, "y": 3}, {"c": 4}) if removed not in h]
+
+
+def test_an_effect_beside_another_is_not_established_without_time_for_errors_of_nominal_values(monkeypatch):
+    def late(*_):
+        raise TimeUpError
+
+    for errors, sure in ((late, [True, False]), (lambda *_: "nominal", [True, True])):
+        made, last = procedure(), node(1.0, effects=2)
+        monkeypatch.setattr(made.revision, "_joint", lambda _, last=last: last)
+        monkeypatch.setattr(revision, "joint_parameters", lambda *_: [(CLEAR,), (CLEAR,)])
+        monkeypatch.setattr(revision, "established_effects", lambda *_: [True, True])
+        monkeypatch.setattr(revision, "nominal_errors", errors)
+        monkeypatch.setattr(revision, "refit_without_effect", lambda *_: node(1.2, effects=1))
+        monkeypatch.setattr(revision, "joint_finding", lambda f, *_: f)
+        monkeypatch.setattr(revision, "with_intervals", lambda last, *_: last)
+        monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+        made.record.findings = [finding(name, 0.5, step=k) for k, name in enumerate("ab")]
+        made.record.groups, made.record.hypotheses = [("a",), ("b",)], [{"a": 1}, {"b": 2}]
+        made.record.widening = {0: "wide", 1: "wide"}
+        fitted, without, established = made.revision._fitted_together([node(9), last])
+        assert established == sure
+        made.revision.remove_unestablished(fitted, without, established)
+        dropped = made.record.findings[1]
+        assert dropped.accepted is sure[1]
+        assert dropped.reason == ("" if sure[1] else "there was no time to tell it from errors of nominal values")
 
 
 def test_an_only_effect_that_may_be_at_its_null_value_leaves_the_model_as_given(monkeypatch):

@@ -118,7 +118,7 @@ def test_a_shorter_step_that_promises_no_more_is_not_fitted(monkeypatch):
     # The motion was simulated with the step as given.
     given = fitted(swung(damping=0.0))
     assert module._division(given, CFG.time_step) > 1
-    monkeypatch.setattr(module, "_refitted", lambda _one: pytest.fail("it promises nothing"))
+    monkeypatch.setattr(module, "refitted", lambda _one: pytest.fail("it promises nothing"))
     assert finer_time_step(given, CFG) is None
 
 
@@ -145,7 +145,7 @@ def test_the_step_is_divided_into_as_many_parts_as_its_error_asks_for(base, monk
 
 
 def test_a_model_without_defects_is_renewed_unchanged(base, monkeypatch):
-    monkeypatch.setattr(module, "_refitted", lambda _one: pytest.fail("nothing to fit again"))
+    monkeypatch.setattr(module, "refitted", lambda _one: pytest.fail("nothing to fit again"))
     assert renew_defects(base, CFG.time_step) is base
 
 
@@ -163,14 +163,14 @@ def test_renewed_defects_are_those_of_the_motion_that_is_fitted_with_them(base):
 
 
 def test_defects_are_renewed_until_they_stay(finer, monkeypatch):
-    refit, done = module._refitted, []
+    refit, done = module.refitted, []
     changes = iter([9.0, 0.31, 0.29, 9.0])
 
     def refitted(one: FittedModel) -> FittedModel:
         done.append(one)
         return refit(one)
 
-    monkeypatch.setattr(module, "_refitted", refitted)
+    monkeypatch.setattr(module, "refitted", refitted)
     monkeypatch.setattr(module, "noise_ratio", lambda _change: next(changes))
     renew_defects(finer, TimeStepCfg())
     assert len(done) == 3
@@ -183,7 +183,7 @@ def test_defects_are_renewed_until_they_stay(finer, monkeypatch):
 def test_an_effect_is_found_beside_a_step_that_is_too_long():
     recording = swung(damping=DAMPING, timestep=FINE)
     coarse = module._with_defects(fitted(recording), FINE)
-    base = renew_defects(module._refitted(coarse), CFG.time_step)
+    base = renew_defects(module.refitted(coarse), CFG.time_step)
     found = fit_candidate(base, screen(base, effect_class("joint_damping")("hinge")))
     added = renew_defects(add_candidate(base, found), CFG.time_step)
     assert added.timestep == FINE
@@ -202,7 +202,7 @@ def test_an_effect_is_found_beside_a_step_that_is_too_long():
 
 def test_states_far_off_are_fitted_by_simulations_with_the_shorter_step():
     given = fitted(swung(damping=0.0, timestep=FINE), 0.5)
-    one = renew_defects(module._refitted(module._with_defects(given, FINE)), CFG.time_step)
+    one = renew_defects(module.refitted(module._with_defects(given, FINE)), CFG.time_step)
     least = TimeStepCfg().max_state_offset
     # Of the last one no more than noise is left.
     spoiled = [np.array(o) for o in ([0.5, 0.5], [9.0, -9.0], [0.0, 0.9 * least], [9.0, 9.0])]

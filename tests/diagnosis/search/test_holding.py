@@ -1,0 +1,138 @@
+"""Friction that holds against friction that creeps, on a stage whose friction was integrated as a set-valued force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import concent_warp as cw
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.search import additions
+from concent_warp.diagnosis.search.holding import hold, with_scene
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.observe import observe
+from concent_warp.model import Model
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.scene.scene import Scene
+from tests.diagnosis.made_up import node, procedure
+
+STEP, MASS, FRICTION, DAMPING, KP, KV, NOISE = 1e-4, 1.6, 2.5, 4.0, 2500.0, 60.0, 2e-5
+STAGE = (
+    "<mujoco><option timestep='.002' integrator='implicitfast'/><worldbody><body><joint name='x' type='slide' "
+    f"axis='1 0 0' damping='{DAMPING}' frictionloss='{FRICTION}'{{own}}/><inertial pos='0 0 0' mass='{MASS}' "
+    "diaginertia='.1 .1 .1'/></body></worldbody>"
+    f"<actuator><position name='motor' joint='x' kp='{KP}' kv='{KV}'/></actuator>"
+    "<sensor><jointpos name='scale' joint='x'/></sensor></mujoco>"
+)
+CFG = DiagnoseCfg(jobs=1, explain=False)
+
+
+def driven(own: str = "", creeps: bool = False) -> Recording:
+    """Return a stage that moves between rests, with friction that holds, or as the model's own."""
+    rng = np.random.default_rng(3)
+    targets = np.cumsum(rng.uniform(0.004, 0.03, 12) * np.where(np.arange(12) % 3 == 2, -1.5, 1.0))
+    time = np.arange(240) / 60
+    command = np.interp(time % (4 / 12) / 0.15, [0, 1], [0, 1]) * np.diff(targets, prepend=0).repeat(20)
+    command += np.r_[0, targets[:-1]].repeat(20)
+    count = round(time[-1] / STEP)
+    wanted = command[np.minimum((np.arange(count) * STEP * 60 + 1e-9).astype(int), 239)]
+    scene = Scene(STAGE.format(own=own))
+    if creeps:
+        position = simulated(Model(scene), wanted)
+    else:
+        q, v, position = 0.0, 0.0, np.empty(count)
+        for k, u in enumerate(wanted):
+            position[k] = q
+            free = v + STEP * (KP * (u - q) - (KV + DAMPING) * v) / MASS
+            v = float(np.sign(free)) * max(abs(free) - STEP * FRICTION / MASS, 0.0)
+            q += STEP * v
+    seen = np.arange(0, count, 40)
+    reading = position[seen, None] + rng.normal(0, NOISE, (len(seen), 1))
+    measured = {"scale": Channel(seen * STEP, reading, noise_std=NOISE)}
+    action = {"motor": Channel(time, command)}
+    return Recording(scene.xml, (Demonstration("d", action=action, measured=measured),))
+
+
+def simulated(model: Model, wanted: np.ndarray) -> np.ndarray:
+    """Return the position of the stage at each of the times of its commands, as the model predicts it."""
+    import mujoco
+
+    m = model.compile()
+    d, every = mujoco.MjData(m), round(m.opt.timestep / STEP)
+    at_steps = [0.0]
+    for u in wanted[::every]:
+        d.ctrl[0] = u
+        mujoco.mj_step(m, d)
+        at_steps.append(float(d.qpos[0]))
+    return np.interp(np.arange(len(wanted)) / every, np.arange(len(at_steps)), at_steps)
+
+
+def fitted(recording: Recording) -> FittedModel:
+    model = Model(Scene(recording.scene))
+    windows = observe(model, recording)
+    return fit_baseline(model, windows, cut_blocks(windows))
+
+
+@pytest.fixture(scope="module")
+def held() -> Recording:
+    """Return a recording of friction that holds."""
+    return driven()
+
+
+def test_friction_that_holds_explains_more_where_the_stage_rests(held):
+    base = fitted(held)
+    found, said = hold(base, (), CFG)
+    assert (said[0].where, said[0].settings["solreffriction"]) == ("joints", "0.003 1")
+    assert said[0].gain > 0.5
+    assert 0 < said[0].low < said[0].gain < said[0].high
+    assert found.ratio < 0.65 * base.ratio
+    np.testing.assert_allclose(found.model.scene.model.dof_solref, [[0.003, 1.0]])
+    assert 'solreffriction="0.003 1"' in said[0].sentence
+    assert hold(found, said, CFG) == (found, said)
+    assert with_scene(found, base.model.scene, CFG.time_step).errors.sum() == pytest.approx(base.errors.sum(), rel=0.02)
+
+
+def test_friction_that_creeps_stays_where_the_data_creep_or_the_model_says_so(held):
+    own = " solreffriction='0.02 1' solimpfriction='0.9 0.95 0.001'"
+    for recording in (driven(creeps=True), replace(held, scene=STAGE.format(own=own))):
+        base = fitted(recording)
+        assert hold(base, (), CFG) == (base, ())
+
+
+def test_nothing_is_missing_from_a_stage_whose_friction_holds(held, tmp_path):
+    effects = ("backlash", "actuator_gain")  # none of these, where friction creeps
+    found = cw.diagnose(Model(Scene(held.scene)), held, replace(CFG, effects=effects))
+    assert (found.verdict, found.accepted) == ("none_needed", ())
+    (said,) = found.to_json()["holding"]
+    assert (said["where"], said["gain"]["value"] > 0.5) == ("joints", True)
+    assert found.ratio[0] > 3 > 1.25 > found.ratio[-1]
+    assert any("creeps" in sentence for sentence in found.sentences())
+    found.model.save(tmp_path / "model.toml")
+    compared = cw.compare(cw.load_model(tmp_path / "model.toml"), held)
+    ratio = compared.summarise("model", "scale").ratio
+    assert ratio is not None
+    assert ratio < 1.3
+
+
+def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any):
+    made, asked = procedure(max_additions=1), []
+    nodes = [node(3.0), node(1.5, effects=1), node(1.0, effects=1)]
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(made.context, "nominal", lambda *_: None)
+    monkeypatch.setattr(made.additions.finder, "find", lambda *_, **__: (nodes[1], ()))
+    monkeypatch.setattr(
+        additions, "hold", lambda one, known, _cfg: asked.append((one, known)) or (nodes[2], ("joints",))
+    )
+    assert made.additions.add_effects(nodes[:1], ())[0] == [nodes[0], nodes[2]]
+    assert asked == [(nodes[1], ())]
+    assert made.record.holding == ("joints",)
+    alone = procedure(max_additions=1)
+    monkeypatch.setattr(alone.additions.finder, "find", lambda *_, **__: (nodes[1], ()))
+    assert alone.additions.add_effects(nodes[:1], (), effects_alone=True)[0] == nodes[:2]
+    assert len(asked) == 1

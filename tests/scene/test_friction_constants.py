@@ -1,0 +1,69 @@
+"""Constants of friction that hold, where the MJCF leaves them at their defaults."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from concent_warp.scene.holding import FRICTION_IMPEDANCE, with_holding_friction
+from concent_warp.scene.scene import Scene
+
+MASS = 1.2345678901
+SCENE = (
+    "<mujoco><option timestep='.002'{option}/>{default}<worldbody><body><joint name='a' type='slide'{joint}/>"
+    f"<inertial pos='0 0 0' mass='{MASS}' diaginertia='.1 .1 .1'/>"
+    "<body><joint name='b' frictionloss='.2' axis='0 1 0'/><geom size='.1'/></body></body></worldbody></mujoco>"
+)
+
+
+def scene(joint: str = " frictionloss='1'", default: str = "", option: str = "") -> Scene:
+    return Scene(SCENE.format(joint=joint, default=default, option=option))
+
+
+@pytest.mark.parametrize(
+    "default",
+    [
+        "",
+        "<default/>",
+        "<default><geom mass='1'/></default>",
+        "<default><joint damping='3'/><default class='c'/></default>",
+    ],
+)
+def test_friction_of_joints_holds_where_nothing_is_said_of_it(default):
+    given = scene(default=default)
+    found = with_holding_friction(given, "joints")
+    assert found is not None
+    np.testing.assert_allclose(found.model.dof_solref, [[0.003, 1.0]] * 2)
+    np.testing.assert_allclose(found.model.dof_solimp[:, :2], FRICTION_IMPEDANCE)
+    for name in ("body_mass", "dof_damping", "dof_frictionloss", "dof_armature", "geom_solref", "jnt_solref"):
+        np.testing.assert_array_equal(getattr(found.model, name), getattr(given.model, name))
+    assert found.model.body_mass[1] == MASS
+    assert with_holding_friction(found, "joints") is None
+
+
+def test_constants_that_the_mjcf_sets_stay():
+    own = "solreffriction='.05 1' solimpfriction='.8 .9 .001'"
+    found = with_holding_friction(scene(joint=f" frictionloss='1' {own}"), "joints")
+    assert found is not None
+    np.testing.assert_allclose(found.model.dof_solref, [[0.05, 1.0], [0.003, 1.0]])
+    np.testing.assert_allclose(found.model.dof_solimp[0, :2], [0.8, 0.9])
+    assert with_holding_friction(scene(default=f"<default><joint {own}/></default>"), "joints") is None
+    joint, inner = " class='c' frictionloss='1'", f"<default><default class='c'><joint {own}/></default></default>"
+    found = with_holding_friction(scene(joint=joint, default=inner), "joints")
+    assert found is not None
+    np.testing.assert_allclose(found.model.dof_solref, [[0.05, 1.0], [0.003, 1.0]])
+
+
+def test_joints_without_friction_have_nothing_to_hold_by():
+    assert with_holding_friction(Scene(scene().xml.replace("frictionloss", "damping")), "joints") is None
+
+
+@pytest.mark.parametrize(
+    ("option", "held"), [(" cone='elliptic'", True), ("", False), (" cone='elliptic' impratio='3'", False)]
+)
+def test_contacts_hold_by_the_ratio_of_impedances_of_elliptic_cones(option, held):
+    found = with_holding_friction(scene(option=option), "contacts")
+    assert (found is not None) == held
+    if found is not None:
+        assert found.model.opt.impratio == 10.0
+        np.testing.assert_array_equal(found.model.dof_solref, scene().model.dof_solref)
