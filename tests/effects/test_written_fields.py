@@ -346,10 +346,10 @@ def test_friction_of_a_contact_of_too_few_dimensions_is_none():
     [
         (SlidingFriction, 3, [3, 3], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),
         (SlidingFriction, 1, [3, 3], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),
-        (TorsionalFriction, 3, [3, 4], [[0.4, 1e-5, 0.0002], [0.8, 1e-5, 0.0004]]),
+        (TorsionalFriction, 3, [3, 3], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),  # a force beside the contacts
         (TorsionalFriction, 4, [3, 4], [[0.4, 1e-5, 0.0002], [0.8, 0.003, 0.0004]]),
-        (RollingFriction, 4, [3, 6], [[0.4, 1e-5, 1e-5], [0.8, 0.003, 1e-5]]),
-        (RollingFriction, 3, [3, 6], [[0.4, 1e-5, 1e-5], [0.8, 1e-5, 1e-5]]),
+        (RollingFriction, 4, [3, 4], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),
+        (RollingFriction, 6, [3, 6], [[0.4, 1e-5, 1e-5], [0.8, 0.003, 0.0004]]),
     ],
 )
 def test_friction_that_comes_anew_begins_next_to_nothing(effect, start, condims, frictions):
