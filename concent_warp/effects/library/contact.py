@@ -30,6 +30,9 @@ MIN_FRICTION = 1e-5
 COULOMB = f"Coulomb friction in MuJoCo's contacts, the larger of the two geoms' coefficients ({MUJOCO})"
 
 
+TURNING = "Coulomb friction: a torque beside MuJoCo's contacts where the model has none, else that of the contacts"
+
+
 class SurfaceEffect(Effect):
     """An effect on contacts between a free body and static geoms."""
 
@@ -144,7 +147,7 @@ class TorsionalFriction(TurningFriction):
 
     name = "torsional_friction"
     summary = "The torque about the contact normal is at most a coefficient times the normal force."
-    source = COULOMB
+    source = TURNING
     signature = "spin about the normal that dies away too soon, while sliding is right"
     confusions = ("sliding_friction", "inertia", "rolling_friction")
     formula_error = FRICTION_SCATTER
@@ -160,7 +163,7 @@ class RollingFriction(TurningFriction):
 
     name = "rolling_friction"
     summary = "The torque about tangents of a contact is at most a coefficient times the normal force."
-    source = COULOMB
+    source = TURNING
     signature = "rolling that slows down at a constant rate"
     confusions = ("sliding_friction", "air_drag", "gravity_tilt")
     formula_error = FRICTION_SCATTER
