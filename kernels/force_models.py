@@ -195,6 +195,55 @@ def add_anisotropic_friction(
     )
 
 
+def add_turning_friction(
+    m: mjw.Model,
+    d: mjw.Data,
+    moving: wp.array[Any],
+    still: wp.array[Any],
+    values: wp.array[Any],
+    contacts: float,
+    *,
+    rolling: bool,
+) -> None:
+    """Add a torque of at most c N against rotation where a body touches what stands still.
+
+    Args:
+        m: Model.
+        d: Data; `xfrc_applied` is added to.
+        moving: Which geoms are the body's, shape (ngeom,) bool.
+        still: Which geoms stand still, shape (ngeom,) bool.
+        values: The coefficient c [m], shape (N, 1).
+        contacts: Contacts that together stop the body in one step at most [-].
+        rolling: Whether it acts against rolling, else against turning in place.
+    """
+    contact = d.contact
+    wp.launch(
+        turning_kernel,
+        dim=d.naconmax,
+        inputs=[
+            int(m.opt.cone),
+            moving,
+            still,
+            values,
+            contacts,
+            wp.bool(rolling),
+            m.opt.timestep,
+            m.geom_bodyid,
+            m.body_inertia,
+            d.nacon,
+            contact.worldid,
+            contact.geom,
+            contact.dim,
+            contact.efc_address,
+            contact.frame,
+            d.efc.force,
+            d.ximat,
+            d.cvel,
+        ],
+        outputs=[d.xfrc_applied],
+    )
+
+
 def add_adhesion(
     m: mjw.Model,
     d: mjw.Data,
@@ -580,6 +629,89 @@ def anisotropic_kernel(
     force = wp.vec3(0.0, (1.0 - values[world, 0]) * friction[i][0] * pressed * velocity[1] / speed, 0.0)
     torque = wp.cross(position[i] - xipos[world, body], force)
     wp.atomic_add(applied, world, body, wp.spatial_vector(force, torque))
+
+
+@wp.kernel
+def turning_kernel(
+    cone: int,
+    moving: wp.array[bool],
+    still: wp.array[bool],
+    values: wp.array2d[float],
+    together: float,
+    rolling: wp.bool,
+    timestep: wp.array[float],
+    body_of: wp.array[int],
+    inertia: wp.array2d[wp.vec3],
+    contacts: wp.array[int],
+    world_of: wp.array[int],
+    geom: wp.array[wp.vec2i],
+    condim: wp.array[int],
+    address: wp.array2d[int],
+    frame: wp.array[wp.mat33],
+    efc_force: wp.array2d[float],
+    ximat: wp.array2d[wp.mat33],
+    cvel: wp.array2d[wp.spatial_vector],
+    applied: wp.array2d[wp.spatial_vector],
+):
+    """See `add_turning_friction`; dim the contact capacity.
+
+    Args:
+        cone: Kind of friction cone.
+        moving: Shape (ngeom,).
+        still: Shape (ngeom,).
+        values: Shape (N, 1).
+        together: Contacts that together stop the body in one step at most.
+        rolling: Whether across the normal, else about it.
+        timestep: [s], shape (1,) or (N,).
+        body_of: Body of each geom, shape (ngeom,).
+        inertia: Principal inertias [kg m^2], shape (1 or N, nbody).
+        contacts: Contacts found in all worlds, shape (1,).
+        world_of: World of each contact, shape (capacity,).
+        geom: Its two geoms, shape (capacity,).
+        condim: Its dimensions, shape (capacity,).
+        address: Its constraint rows, -1 where it is not active, shape (capacity, rows).
+        frame: Its frame, normal first, shape (capacity,).
+        efc_force: Forces of the constraint rows, shape (N, rows).
+        ximat: Principal axes of inertia, shape (N, nbody).
+        cvel: Angular and linear velocities of bodies, shape (N, nbody).
+        applied: Forces and torques on bodies, shape (N, nbody), added to.
+    """
+    i = wp.tid()
+    if i >= contacts[0]:
+        return
+    first = address[i, 0]
+    pair = geom[i]
+    if first < 0 or pair[0] < 0 or pair[1] < 0:
+        return
+    mine = pair[1]
+    if not (moving[pair[1]] and still[pair[0]]):
+        mine = pair[0]
+        if not (moving[pair[0]] and still[pair[1]]):
+            return
+
+    world = world_of[i]
+    pressed = efc_force[world, first]
+    rows = wp.where(cone == PYRAMIDAL and condim[i] > 1, 2 * (condim[i] - 1), 1)
+    for k in range(1, rows):
+        if first + k < efc_force.shape[1]:
+            pressed += efc_force[world, first + k]
+
+    body = body_of[mine]
+    spin = wp.spatial_top(cvel[world, body])
+    normal = wp.vec3(frame[i][0, 0], frame[i][0, 1], frame[i][0, 2])
+    about = normal * wp.dot(normal, spin)
+    if rolling:
+        about = spin - about
+    rate = wp.length(about)
+    if rate <= 0.0:
+        return
+    axis = about / rate
+    along = wp.transpose(ximat[world, body]) @ axis
+    i3 = inertia[world % inertia.shape[0], body]
+    eased = along[0] * along[0] / i3[0] + along[1] * along[1] / i3[1] + along[2] * along[2] / i3[2]
+    stopping = rate / (together * timestep[world % timestep.shape[0]] * eased)
+    torque = wp.min(wp.max(values[world, 0], 0.0) * pressed, stopping)
+    wp.atomic_add(applied, world, body, wp.spatial_vector(wp.vec3(0.0), -torque * axis))
 
 
 @wp.kernel

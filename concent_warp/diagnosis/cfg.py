@@ -253,6 +253,9 @@ class TimeStepCfg:
     max_renewals: Count = 5
     """Most times that what a shorter step changes is computed again about the fit to it, until it changes by less than
     `max_error`."""
+    decisive_gain: Share = 0.9
+    """Share of the error that a shorter step must remove to be used before effects are looked for [-]: an effect that
+    removes more still is more likely to stand in for the step and a part of what else is missing. Empirical."""
 
 
 @dataclass(frozen=True)
@@ -339,6 +342,10 @@ class DiagnoseCfg:
     max_remainder: Share = 0.15
     """Share of such a remainder that a further effect may leave, if it is to be named all the same [-]: one that is
     missing explains nearly all of it, one that takes up an error in a formula a part. Empirical."""
+    max_typical_sizes: Positive = 30.0
+    """Size of a parameter over its typical size, from which on an effect is not accepted where what it explains is less
+    than `max_form_error` of the first discrepancy [-]: 2 % of the Cauchy prior of sizes lie beyond. Of so small a
+    remainder an error in the formulas of the effects before it is the more plausible cause."""
     null_samples: Annotated[int, Bounds(1, 1_000_000)] = 400
     """Sign-flipped data sets from which the null distribution of the best candidate's gain is taken; the smallest
     p-value is 1 / (null_samples + 1)."""

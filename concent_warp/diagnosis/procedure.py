@@ -317,7 +317,11 @@ class Procedure:
             return found
         runner.progress(0.06, "fitting the model as given, its own error in the place of the noise")
         self.noise_scale = found.noise_ratio / search.contact_ratio
-        return self._refitted(self.model, self._windows(self.model, cfg.window))
+        raised = self._windows(self.model, cfg.window)
+        if len(raised) > len(windows):  # a body that spins: initial states within so much noise soon differ by a turn
+            self.noise_scale = 1.0
+            return found
+        return self._refitted(self.model, raised)
 
     def _windows(self, model: Model, length: float | None) -> Sequence[Window]:
         """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None."""

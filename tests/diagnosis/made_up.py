@@ -44,8 +44,10 @@ def node(
     window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))], defect=None)
     return SimpleNamespace(
         ratio=ratio, noise_ratio=10 * ratio, errors=np.array([errors / 2] * 2), model=model, windows=[window],
-        fit=SimpleNamespace(offsets="o", cost=errors), pieces=[piece], cfg=EffectSolverCfg(), timestep=timestep,
-        limit=1e9, noise_scale=1.0,
+        fit=SimpleNamespace(offsets="o", cost=errors, values=np.zeros(0)), pieces=[piece], cfg=EffectSolverCfg(),
+        timestep=timestep,
+        limit=1e9, noise_scale=1.0, effect=None,
+        prediction=lambda _effect: SimpleNamespace(owned=0, parameters=()),
         delivered=SimpleNamespace(name=f"delivered {name}", timestep=timestep),
     )  # fmt: skip
 

@@ -175,6 +175,17 @@ def test_the_error_of_a_model_far_off_takes_the_place_of_the_noise_where_a_free_
     assert made.noise == {"angle": 0.002, "place": 0.01}
 
 
+@pytest.mark.parametrize(("count", "scale"), [(1, 20.0), (2, 20.0), (3, 1.0)])
+def test_the_noise_stays_where_windows_would_be_shorter_with_the_error_in_its_place(monkeypatch, count, scale):
+    made, (window, *_) = procedure(), windows_of(RECORDING)
+    monkeypatch.setattr(module, "channel_noises", lambda *_: {"angle": 0.002})
+    monkeypatch.setattr(module, "observe", lambda *_, noise, **_k: [window] * (2 if noise["angle"] == 0.002 else count))
+    monkeypatch.setattr(module, "has_touchable_free_body", lambda _: True)
+    monkeypatch.setattr(made, "_refitted", lambda _model, windows: SimpleNamespace(noise_ratio=60.0, windows=windows))
+    assert [w.noise_scale for w in made.baseline().windows] == [scale] * (2 if scale == 1 else count)
+    assert made.noise_scale == scale
+
+
 def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monkeypatch):
     made = procedure()
     made.record.groups, made.record.hypotheses = [("a",), ("b",), ("c",)], [{"a": 1}, {"b": 2}, {"c": 3}]

@@ -63,11 +63,25 @@ def test_rolling_ball_slows_down_at_the_rate_that_rolling_friction_gives(mu):
     assert ball.qpos[-1, 0] == pytest.approx((0.5**2 - left**2) / (2 * slower), rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("effect", "mu", "slower"), [(TorsionalFriction, 2e-4, 1 / 0.4), (RollingFriction, 3e-4, 1 / 1.4)]
+)
+@pytest.mark.parametrize("cones", ["", 'cone="elliptic"'])
+def test_small_friction_against_rotation_is_constant_whatever_cones_the_model_has(effect, mu, slower, cones):
+    scene = BALL.replace('cone="elliptic" impratio="10"', cones)
+    spin, axis = 5.0, 5 if effect is TorsionalFriction else 4
+    speed = [spin * RADIUS if axis == 4 else 0, 0, 0, 0, 0, 0]
+    speed[axis] = spin
+    ball = move(world(scene, effect("thing"), mu), 0.8, qvel=speed)
+    left = spin - mu * G * slower / RADIUS**2 * ball.time
+    np.testing.assert_allclose(ball.qvel[:, axis], left, atol=0.03 * (spin - left[-1]))
+
+
 @pytest.mark.parametrize("effect", [TorsionalFriction, RollingFriction])
 def test_friction_of_more_dimensions_does_not_change_sliding(effect):
     plain = move(world(BLOCK), 0.4, qvel=[0.8, 0.3, 0, 0, 0, 0])
     null = move(world(BLOCK).add(effect("thing")), 0.4, qvel=[0.8, 0.3, 0, 0, 0, 0])
-    np.testing.assert_allclose(null.qpos, plain.qpos, atol=1e-4)
+    np.testing.assert_allclose(null.qpos, plain.qpos, atol=1e-9)
 
 
 def bounce(time_constant: float, damping: float, speed: float) -> float:

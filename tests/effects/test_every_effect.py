@@ -102,12 +102,10 @@ def test_every_effect_applies_somewhere(name):
 def test_null_values_leave_motion_commands_and_readings_as_they_were(scene, effect, plain):
     model = MODELS[scene].add(effect)
     null = move(model, 0.6, **SCENES[scene][1])
-    more_rows = effect.name in ("torsional_friction", "rolling_friction")
-    tolerance = 1e-4 if more_rows else 1e-9
-    np.testing.assert_allclose(null.qpos, plain[scene].qpos, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(null.qpos, plain[scene].qpos, rtol=0, atol=1e-9)
     read = effect.measure(model.compile(), null.read, model.effects[0].array)
     for sensor, value in plain[scene].sensor.items():
-        np.testing.assert_allclose(read(sensor, plain[scene].time), value, rtol=0, atol=1000 * tolerance)
+        np.testing.assert_allclose(read(sensor, plain[scene].time), value, rtol=0, atol=1e-6)
 
 
 def test_null_wind_is_still_air():

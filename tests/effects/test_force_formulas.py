@@ -6,7 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.effects.library.contact_forces import FADE_SPEED, AdhesionForce, AnisotropicForce, _outermost
+from concent_warp.effects.library.contact_forces import (
+    FADE_SPEED,
+    AdhesionForce,
+    AnisotropicForce,
+    TurningForce,
+    _outermost,
+)
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
 from concent_warp.effects.library.gear_forces import BacklashForce, Gear
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownJointForce
@@ -403,3 +409,43 @@ def test_force_on_joints_is_the_sum_of_their_bumps(moving):
     assert model.count == 8
     model.apply(m, d, values)
     np.testing.assert_allclose(d.qfrc_applied[[1, 0]], expected, rtol=1e-12)
+
+
+def turning(m: mujoco.MjModel, d: mujoco.MjData, body: int, coefficient: float, *, rolling: bool) -> np.ndarray:
+    """Return the generalised forces (nv,) of friction against rotation at a body's contacts with the world."""
+    total, jacobian, stiff = np.zeros(m.nv), np.zeros((3, m.nv)), d.ximat[body].reshape(3, 3)
+    mujoco.mj_jac(m, d, None, jacobian, d.xipos[body], body)
+    spin = jacobian @ d.qvel
+    for i, contact in enumerate(d.contact):
+        if sorted(m.geom_bodyid[contact.geom].tolist()) != sorted([0, body]) or contact.efc_address < 0:
+            continue
+        force, normal = np.zeros(6), contact.frame[:3]
+        mujoco.mj_contactForce(m, d, i, force)
+        part = normal * (normal @ spin)
+        part = spin - part if rolling else part
+        axis = part / np.linalg.norm(part)
+        inertia = 1 / (axis @ stiff @ np.diag(1 / m.body_inertia[body]) @ stiff.T @ axis)
+        most = inertia * np.linalg.norm(part) / (4 * m.opt.timestep)
+        total -= jacobian.T @ axis * min(coefficient * force[0], most)
+    return total
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize("rolling", [False, True])
+@pytest.mark.parametrize(("speed", "coefficient"), [(3.0, 2e-4), (0.01, 0.1)])
+def test_friction_against_rotation_is_the_formula_at_each_contact_with_fixed_geoms(cone, rolling, speed, coefficient):
+    m = mujoco.MjModel.from_xml_string(SLIDING.format(cone=cone))
+    d, rng = mujoco.MjData(m), np.random.default_rng(5)
+    mujoco.mj_step(m, d, nstep=60)
+    while not any(sorted(m.geom_bodyid[c.geom]) == [0, 1] and c.dim == 3 for c in d.contact):
+        mujoco.mj_step(m, d)
+    d.qvel[:] = rng.normal(0, speed, m.nv)
+    d.qvel[2] = -0.2
+    mujoco.mj_forward(m, d)
+    body = m.body("first").id
+    expected = turning(m, d, body, coefficient, rolling=rolling)
+    assert np.abs(expected[3:6]).max() > 1e-6
+    d.xfrc_applied[:] = 0
+    TurningForce(m, np.array([body]), rolling=rolling).bound(m, d, np.array([coefficient]))()
+    np.testing.assert_allclose(applied_as_joint_forces(m, d), expected, rtol=1e-9, atol=1e-12)
+    assert (d.xfrc_applied[[0, m.body("other").id]] == 0).all()

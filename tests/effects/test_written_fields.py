@@ -209,6 +209,16 @@ def test_gravity_compensation_adds_to_that_of_the_links():
     assert model.compile().ngravcomp > 0
 
 
+def test_a_drive_goes_on_compensating_the_weight_that_it_knows_whatever_the_mass():
+    xml = TWO.replace('<body name="b"', '<body name="b" gravcomp="0.9"')
+    before, after = written(Mass("b"), 3.0, xml=xml)
+    np.testing.assert_allclose(after.body_gravcomp * after.body_mass, before.body_gravcomp * before.body_mass)
+    assert before.body_gravcomp[2] == 0.9
+    assert Mass("b").fields(before) == ("body_mass", "body_inertia", "body_gravcomp")
+    heavy = world(xml).add_effect("nominal_mass", ["b"], {"mass[b]": 1.01}).compile()
+    np.testing.assert_allclose(heavy.body_gravcomp * heavy.body_mass, before.body_gravcomp * before.body_mass)
+
+
 def test_mass_and_inertia_are_scaled():
     before, after = written(Mass("b"), 3.0)
     np.testing.assert_allclose(after.body_mass, before.body_mass * [1, 1, 3])
@@ -346,10 +356,10 @@ def test_friction_of_a_contact_of_too_few_dimensions_is_none():
     [
         (SlidingFriction, 3, [3, 3], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),
         (SlidingFriction, 1, [3, 3], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),
-        (TorsionalFriction, 3, [3, 4], [[0.4, 1e-5, 0.0002], [0.8, 1e-5, 0.0004]]),
+        (TorsionalFriction, 3, [3, 3], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),  # a force beside the contacts
         (TorsionalFriction, 4, [3, 4], [[0.4, 1e-5, 0.0002], [0.8, 0.003, 0.0004]]),
-        (RollingFriction, 4, [3, 6], [[0.4, 1e-5, 1e-5], [0.8, 0.003, 1e-5]]),
-        (RollingFriction, 3, [3, 6], [[0.4, 1e-5, 1e-5], [0.8, 1e-5, 1e-5]]),
+        (RollingFriction, 4, [3, 4], [[0.4, 0.006, 0.0002], [0.8, 0.003, 0.0004]]),
+        (RollingFriction, 6, [3, 6], [[0.4, 1e-5, 1e-5], [0.8, 0.003, 0.0004]]),
     ],
 )
 def test_friction_that_comes_anew_begins_next_to_nothing(effect, start, condims, frictions):

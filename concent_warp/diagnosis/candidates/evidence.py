@@ -201,9 +201,26 @@ def surprise(effect: Effect, parameters: Sequence[Parameter], values: Sequence[f
         values: Their values.
         count: Observations, for Schwarz's criterion.
     """
-    scale = np.array([max(p.scale, p.typical) for p in parameters])
-    away = np.array([v - p.null if np.isfinite(p.null) else 0.0 for v, p in zip(values, parameters, strict=True)])
-    return float(2 * np.log1p((away / scale) ** 2).sum() + len(scale) * np.log(count) + effect.rarity)
+    sizes = _sizes(parameters, values)
+    return float(2 * np.log1p(sizes**2).sum() + len(sizes) * np.log(count) + effect.rarity)
+
+
+def largest_size(base: FittedModel, c: FittedCandidate) -> float:
+    """Return the largest size of a candidate's own parameters, over their typical sizes [-].
+
+    Args:
+        base: The fitted baseline.
+        c: The candidate.
+    """
+    prediction = base.prediction(c.effect)
+    own = slice(prediction.owned, None)
+    return float(np.abs(_sizes(prediction.parameters[own], c.fit.values[own])).max(initial=0.0))
+
+
+def _sizes(parameters: Sequence[Parameter], values: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the differences of values from the null values over typical ones, shape (P,); 0 where null is infinite."""
+    away = [v - p.null if np.isfinite(p.null) else 0.0 for v, p in zip(values, parameters, strict=True)]
+    return np.array(away) / np.array([max(p.scale, p.typical) for p in parameters])
 
 
 def detectable_size(base: FittedModel, s: ScreenedCandidate, share: float) -> Detectable | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import add_candidate
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.candidates.evidence import leaves_more
+from concent_warp.diagnosis.candidates.evidence import largest_size, leaves_more
 from concent_warp.diagnosis.result import Detectable
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio
 from concent_warp.diagnosis.search.context import SearchContext
@@ -71,6 +71,9 @@ class Additions:
             if finer is not None and not is_lacking(finer, factors, cfg):
                 fitted = self._adopt(fitted, finer)
                 break
+            if finer is not None and self._is_decisive(fitted[-1], finer):
+                fitted = self._adopt(fitted, finer)
+                continue
             bounded, before = None, record.time_step
             if not effects_alone and (found := self._with_nominal(fitted, finer, first)) is not None:
                 if step >= cfg.max_additions or not self._is_at_bounds(found[-1]):
@@ -110,6 +113,9 @@ class Additions:
                 break
             if best is not None and correction is not None and not self._explains_more(fitted[-1], best, correction):
                 record.take_back(*recorded, "explains no more than a flexible correction of the effects before it")
+                best = None
+            if best is not None and self._is_implausible(fitted[-1], best, first):
+                record.take_back(*recorded, "explains a small remainder by a size that is far beyond typical ones")
                 best = None
             if best is None:
                 record.form_corrected = self._is_corrected(fitted[-1], correction)
@@ -154,6 +160,13 @@ class Additions:
         errors = with_interleaved_folds(add_candidate(one, best)).errors
         return leaves_more(correction, errors, self.context.cfg.search)
 
+    def _is_implausible(self, one: FittedModel, best: FittedCandidate, first: FittedModel) -> bool:
+        """Return whether a candidate explains a small remainder of a model by a size that hardly any machine has."""
+        cfg, (left, lacked) = self.context.cfg, discrepancies(one, first)
+        if one is first or left >= cfg.max_form_error * lacked:
+            return False
+        return largest_size(one, best) > cfg.max_typical_sizes
+
     def _is_corrected(self, one: FittedModel, correction: np.ndarray | None) -> bool:
         """Return whether a flexible correction of the effects of a model leaves little more than noise."""
         if correction is None:
@@ -183,6 +196,11 @@ class Additions:
         unsettled = "Open: whether the model's time step is too long."
         cfg = replace(context.cfg, min_gain=context.least_gain(one))
         return context.budget.attempt(lambda: finer_time_step(one, cfg), None, unsettled)
+
+    def _is_decisive(self, one: FittedModel, finer: FittedModel) -> bool:
+        """Return whether a shorter time step explains so much that no effect may take its place."""
+        left = float(finer.errors.sum() / max(one.errors.sum(), 1e-12))
+        return left <= 1 - self.context.cfg.time_step.decisive_gain
 
     def _with_nominal(
         self, fitted: list[FittedModel], finer: FittedModel | None, first: FittedModel

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.library.contact_forces import AdhesionForce, AnisotropicForce
+from concent_warp.effects.library.contact_forces import AdhesionForce, AnisotropicForce, TurningForce
 from concent_warp.effects.library.drives import GRIP_FACTORS
 from concent_warp.effects.library.joints import FRICTION_SCATTER, MUJOCO
 from concent_warp.effects.select import (
@@ -28,6 +28,9 @@ SLIDING, TORSIONAL, ROLLING = 0, 1, 2
 MIN_FRICTION = 1e-5
 """MuJoCo's smallest friction coefficient."""
 COULOMB = f"Coulomb friction in MuJoCo's contacts, the larger of the two geoms' coefficients ({MUJOCO})"
+
+
+TURNING = "Coulomb friction: a torque beside MuJoCo's contacts where the model has none, else that of the contacts"
 
 
 class SurfaceEffect(Effect):
@@ -58,11 +61,14 @@ class FrictionEffect(SurfaceEffect):
     """Which of MuJoCo's three coefficients."""
     condim: int
     """Dimension that a contact needs to have it."""
+    turns: ClassVar[bool] = False
+    """Whether it acts against rotation: as a force beside MuJoCo's contacts where the model has no such friction."""
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Give the contacts the dimension, with next to no friction where it comes anew."""
-        raised = [geom for n in self.target for geom in _colliding(spec.body(n).geoms) if geom.condim < self.condim]
-        if not raised:
+        """Give the contacts of all geoms the dimension, with next to no friction where it comes anew."""
+        mine = [geom for n in self.target for geom in _colliding(spec.body(n).geoms)]
+        raised = [geom for geom in mine if geom.condim < self.condim]
+        if not raised or (self.turns and len(raised) == len(mine)):
             return
         for geom in _colliding(spec.geoms):
             for column, needed in ((TORSIONAL, 4), (ROLLING, 6)):
@@ -73,20 +79,42 @@ class FrictionEffect(SurfaceEffect):
 
     def null(self, m: mujoco.MjModel) -> float:
         """Return the coefficient that the model has."""
-        body = np.concatenate([geoms_of(m, b) for b in self.ids(m)])
-        if m.geom_condim[body].max() < self.condim:
+        if self._lacks(m):
             return 0.0
         return float(m.geom_friction[self.geoms(m), self.column].max())
 
-    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+    def _lacks(self, m: mujoco.MjModel) -> bool:
+        """Return whether the contacts of a model have no such friction."""
+        return bool(m.geom_condim[np.concatenate([geoms_of(m, b) for b in self.ids(m)])].max() < self.condim)
+
+    def _is_new(self, m: mujoco.MjModel) -> bool:
+        """Return whether it is a force beside the contacts of a model."""
+        return self.turns and self._lacks(m)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
         """Friction."""
-        return ("geom_friction",)
+        return () if self._is_new(m) else ("geom_friction",)
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the largest coefficient, and all others in proportion."""
+        if self._is_new(m):
+            return
         geoms = self.geoms(m)
         share = np.maximum(m.geom_friction[geoms, self.column], MIN_FRICTION)
         m.geom_friction[geoms, self.column] = np.maximum(values[0] * share / share.max(), MIN_FRICTION)
+
+
+class TurningFriction(FrictionEffect):
+    """Friction against rotation.
+
+    In MuJoCo's contacts a small coefficient does not bound the torque: up to tens of rad/s it grows with the rate.
+    """
+
+    turns = True
+
+    def force_model(self, m: mujoco.MjModel) -> ForceModel | None:
+        """Return the torque of contacts that have no such friction yet."""
+        return TurningForce(m, self.ids(m), rolling=self.column == ROLLING) if self._is_new(m) else None
 
 
 FRICTION_FACTORS = (0.4, 0.7, 1.4, 2.0, 2.8)
@@ -114,12 +142,12 @@ class SlidingFriction(FrictionEffect):
         return (Parameter("coefficient", "-", null, 0.0, MAX_FRICTION, 0.15, scan=scan),)
 
 
-class TorsionalFriction(FrictionEffect):
+class TorsionalFriction(TurningFriction):
     """Friction against spinning in place."""
 
     name = "torsional_friction"
     summary = "The torque about the contact normal is at most a coefficient times the normal force."
-    source = COULOMB
+    source = TURNING
     signature = "spin about the normal that dies away too soon, while sliding is right"
     confusions = ("sliding_friction", "inertia", "rolling_friction")
     formula_error = FRICTION_SCATTER
@@ -130,12 +158,12 @@ class TorsionalFriction(FrictionEffect):
         return (Parameter("coefficient", "m", self.null(m), 0.0, 0.2, 0.005, scan=(0.002, 0.01)),)
 
 
-class RollingFriction(FrictionEffect):
+class RollingFriction(TurningFriction):
     """Friction against rolling."""
 
     name = "rolling_friction"
     summary = "The torque about tangents of a contact is at most a coefficient times the normal force."
-    source = COULOMB
+    source = TURNING
     signature = "rolling that slows down at a constant rate"
     confusions = ("sliding_friction", "air_drag", "gravity_tilt")
     formula_error = FRICTION_SCATTER

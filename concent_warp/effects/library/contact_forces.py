@@ -22,6 +22,9 @@ GEOM = mujoco.mjtGeom
 FADE_SPEED = 2e-3
 """Sliding speed below which the force fades out [m/s], v0 of its formula: friction without it is discontinuous."""
 
+SHARE_OF_STOP = 4.0
+"""Contacts that together stop a turning body in one step at most [-]: the corners of a box, four points of a rim."""
+
 
 class AnisotropicForce(ForceModel):
     """-(ratio - 1) mu N v_y / sqrt(|v|^2 + v0^2) along y at each contact of a body with what stands still.
@@ -85,6 +88,77 @@ class AnisotropicForce(ForceModel):
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
         force_models.add_anisotropic_friction(m, d, *self._device, values, FADE_SPEED)
+
+
+class TurningForce(ForceModel):
+    """A torque -min(c N, I w / (4 dt)) against turning about the normal, or across it, at each contact of a body.
+
+    The contacts are those with what stands still; N is the normal force [N] of the step before, w the rate [rad/s], I
+    the free body's inertia about that axis, dt the time step: `SHARE_OF_STOP` contacts together stop the body in a step
+    at most. The parameter is the coefficient c [m], shape (1,).
+    """
+
+    def __init__(self, m: mujoco.MjModel, bodies: np.ndarray, *, rolling: bool) -> None:
+        """Act on the contacts of some bodies, ids of shape (n,), against rolling or against turning in place."""
+        self.rolling = rolling
+        self.moving = np.zeros(m.ngeom, dtype=bool)
+        self.moving[np.isin(m.geom_bodyid, bodies)] = True
+        self.still = np.zeros(m.ngeom, dtype=bool)
+        self.still[static_geoms(m)] = True
+        self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `ForceModel.bound`."""
+        coefficient = float(values[0])
+        if coefficient <= 0:
+            return lambda: None
+        moving, still, body_of = self.moving.tolist(), self.still.tolist(), m.geom_bodyid.tolist()
+        elliptic, rolling = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, self.rolling
+        stop = 1 / (SHARE_OF_STOP * m.opt.timestep)
+        least = np.maximum(m.body_inertia, mujoco.mjMINVAL).tolist()
+        twist, axes, applied = d.cvel, d.ximat, d.xfrc_applied
+
+        def act() -> None:
+            if not d.ncon:
+                return
+            contact = d.contact
+            pairs, address = contact.geom.tolist(), contact.efc_address.tolist()
+            for i, (first, second) in enumerate(pairs):
+                geom = first if moving[first] and still[second] else second if moving[second] and still[first] else -1
+                if geom < 0 or address[i] < 0:
+                    continue
+                dim = int(contact.dim[i])
+                # A pyramid's edges each carry a share of the normal force.
+                rows = 1 if elliptic or dim == 1 else 2 * (dim - 1)
+                load = sum(d.efc_force[address[i] : address[i] + rows].tolist())
+                body = body_of[geom]
+                (nx, ny, nz), (wx, wy, wz) = contact.frame[i, :3].tolist(), twist[body, :3].tolist()
+                about = nx * wx + ny * wy + nz * wz
+                ax, ay, az = about * nx, about * ny, about * nz
+                if rolling:
+                    ax, ay, az = wx - ax, wy - ay, wz - az
+                rate = math.sqrt(ax * ax + ay * ay + az * az)
+                if rate <= 0:
+                    continue
+                ax, ay, az = ax / rate, ay / rate, az / rate
+                xx, xy, xz, yx, yy, yz, zx, zy, zz = axes[body].tolist()
+                ix, iy, iz = least[body]
+                turned = (ax * xx + ay * yx + az * zx) ** 2 / ix
+                turned += (ax * xy + ay * yy + az * zy) ** 2 / iy + (ax * xz + ay * yz + az * zz) ** 2 / iz
+                torque = -min(coefficient * load, rate * stop / turned)
+                applied[body] += (0.0, 0.0, 0.0, torque * ax, torque * ay, torque * az)
+
+        return act
+
+    def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
+        """See `ForceModel.launch`."""
+        import warp as wp
+
+        from concent_warp.kernels import force_models
+
+        if self._device is None:
+            self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
+        force_models.add_turning_friction(m, d, *self._device, values, SHARE_OF_STOP, rolling=self.rolling)
 
 
 class AdhesionForce(ForceModel):

@@ -13,7 +13,7 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.effects.library.measurement import MeasurementEffect
-from concent_warp.effects.library.objects import Size
+from concent_warp.effects.library.objects import Size, mass_fields
 from concent_warp.effects.select import element_name, free_bodies
 
 TOLERANCE = 0.01
@@ -65,14 +65,15 @@ class NominalMass(NominalBodyValue):
         """Return one factor a body."""
         return nominal_parameters("mass", self.target)
 
-    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Mass and inertia."""
-        return ("body_mass", "body_inertia")
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
+        """Mass and inertia, and the share of the weight that is compensated."""
+        return mass_fields(m, self.ids(m))
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Scale both."""
+        """Scale both; a drive goes on compensating the weight that it knows."""
         ids = self.ids(m)
         m.body_mass[ids] *= values
+        m.body_gravcomp[ids] /= values
         m.body_inertia[ids] *= values[:, None]
 
 

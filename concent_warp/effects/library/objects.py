@@ -44,14 +44,20 @@ class Mass(BodyEffect):
         """Return one factor."""
         return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3, scan=(0.7, 1.4)),)
 
-    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Mass and inertia."""
-        return ("body_mass", "body_inertia")
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
+        """Mass and inertia, and the share of the weight that is compensated."""
+        return mass_fields(m, self.ids(m))
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Scale both."""
+        """Scale both; a drive goes on compensating the weight that it knows."""
         m.body_mass[self.ids(m)] *= values[0]
         m.body_inertia[self.ids(m)] *= values[0]
+        m.body_gravcomp[self.ids(m)] /= values[0]
+
+
+def mass_fields(m: mujoco.MjModel, bodies: np.ndarray) -> tuple[str, ...]:
+    """Return the fields that another mass of some bodies, ids of shape (n,), changes."""
+    return ("body_mass", "body_inertia", *(("body_gravcomp",) if m.body_gravcomp[bodies].any() else ()))
 
 
 class CenterOfMass(BodyEffect):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.search import additions, context
 from concent_warp.diagnosis.search.adequacy import is_lacking
+from concent_warp.effects.effect import Parameter
 from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.made_up import FINER, GIVEN, finding, node, procedure
 
@@ -69,6 +72,37 @@ def test_an_effect_beside_others_must_explain_more_than_a_correction_of_these(
     assert second.reason == ("" if added else "explains no more than a flexible correction of the effects before it")
 
 
+@pytest.mark.parametrize(
+    ("left", "size", "added"),
+    [
+        (30.0, 80.0, False),  # 9 % of the discrepancy, by a size that hardly any machine has
+        (30.0, -80.0, False),
+        (30.0, 20.0, True),
+        (60.0, 80.0, True),  # 36 % is more than an error in a formula
+    ],
+)
+def test_a_small_remainder_is_not_explained_by_a_size_far_beyond_typical_ones(monkeypatch, left, size, added):
+    made, nodes = procedure(), [node(100.0), node(left, effects=1), node(1.0, effects=2)]
+    typical = Parameter("scale", "-", 0.0, -5.0, 5.0, 0.03)
+    nodes[1].prediction = lambda _effect: SimpleNamespace(owned=1, parameters=(typical, typical))
+    nodes[2].fit.values = np.array([9.0, size * typical.scale])
+
+    def find(_base, step, **_):
+        made.record.groups.append((f"effect {step}",))
+        made.record.hypotheses.append({})
+        made.record.findings.append(finding(f"effect {step}", 0.9, accepted=True, step=step))
+        return nodes[step + 1], ()
+
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
+    monkeypatch.setattr(made.additions.finder, "find", find)
+    assert made.additions.add_effects(nodes[:1], ())[0] == nodes[: 2 + added]
+    assert made.record.findings[1].accepted is added
+    assert ("far beyond typical" in made.record.findings[1].reason) is not added
+
+
 def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):
     given, effect = node(3.0, 100.0), node(1.5, 40.0, effects=1)
     for errors, ratio, asked, left in (
@@ -97,6 +131,30 @@ def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):
         assert made.record.groups == [("effect",)] * (len(fitted) - 1)
         assert len(made.record.findings) == len(fitted) - 1
         assert made.record.time_step == ("found" if left[0] == FINER else None)
+
+
+@pytest.mark.parametrize(("errors", "used"), [(9.0, True), (11.0, False)])
+def test_a_shorter_time_step_that_explains_nearly_all_comes_before_an_effect_that_explains_more(
+    monkeypatch, errors, used
+):
+    given, finer, bases = node(10.0, 100.0), node(3.0, errors, timestep=FINER), []
+
+    def find(base, _step, **_):
+        bases.append(base)
+        made.record.groups.append(("effect",))
+        made.record.findings.append(finding("effect", 0.9))
+        return node(1.0, 2.0, effects=1), ()
+
+    made = procedure(max_additions=1)
+    monkeypatch.setattr(made.additions.finder, "find", find)
+    monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg: finer if one is given else None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    fitted, _ = made.additions.add_effects([given], ())
+    assert [one is (finer if used else given) for one in bases] == [True]
+    assert fitted[0] is bases[0]
+    assert made.record.time_step == ("found" if used else None)
 
 
 def test_nominal_values_are_fitted_with_the_shorter_time_step_where_both_explain_more(monkeypatch):
