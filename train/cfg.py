@@ -310,7 +310,7 @@ class PpoCfg:
         200
     """
 
-    iterations: Count = 300
+    iterations: Count = 100
     """Iterations of collecting steps and updating the policy."""
     learning_rate: Annotated[float, Bounds(0, 1, above_low=True)] = 1e-3
     """Initial learning rate [-]."""
@@ -401,9 +401,9 @@ class FinishCfg:
 
     share: Share = 0.33
     """Share of the iterations; 0 for none."""
-    physics: Literal["spheres", "shapes"] = "spheres"
-    """What collides: all spheres of the objects, or the shapes of the scene's geoms in stiff contacts and short steps,
-    as in the stress test; all spheres where the scene has no shapes to collide with."""
+    physics: Literal["shapes", "spheres"] = "shapes"
+    """What collides: the shapes of the scene's geoms in stiff contacts and short steps, as in the stress test, or all
+    spheres of the objects; all spheres, too, where the scene has no shapes to collide with."""
 
 
 @dataclass(frozen=True)

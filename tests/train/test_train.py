@@ -93,11 +93,11 @@ def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, whole, t
 @pytest.mark.parametrize(
     ("collision", "finish", "expected"),
     [
-        ("vcp", FinishCfg(share=0.5), ["events", "events", "spheres", "spheres"]),
-        ("vcp", FinishCfg(share=0.25, physics="shapes"), ["events", "events", "events", "shapes"]),
+        ("vcp", FinishCfg(share=0.5, physics="spheres"), ["events", "events", "spheres", "spheres"]),
+        ("vcp", FinishCfg(share=0.25), ["events", "events", "events", "shapes"]),
         ("vcp", FinishCfg(share=0), ["events"] * 4),
-        ("full", FinishCfg(share=0.5), ["spheres"] * 4),
-        ("full", FinishCfg(share=0.25, physics="shapes"), ["spheres", "spheres", "spheres", "shapes"]),
+        ("full", FinishCfg(share=0.5, physics="spheres"), ["spheres"] * 4),
+        ("full", FinishCfg(share=0.25), ["spheres", "spheres", "spheres", "shapes"]),
     ],
 )
 def test_more_collides_in_the_last_iterations(made, monkeypatch, collision, finish, expected):
