@@ -153,7 +153,6 @@ def page(data: dict[str, dict[str, Any]]) -> str:
     ]
     assert __doc__ is not None
     about = __doc__.split("\n\n")
-    first = next(iter(data.values()))
     return "\n\n".join([
         "# What keeps policies from succeeding in Reality",
         "Written by `benchmarks/train/stuck.py`; do not edit.",
@@ -161,7 +160,7 @@ def page(data: dict[str, dict[str, Any]]) -> str:
         about[2].strip(),
         "Episodes in which object 1 is in place at the end:",
         table(head, lines),
-        machine_line(first["machine"]),
+        *dict.fromkeys(machine_line(row["machine"]) for row in data.values()),
         "Settings of the trainings:\n\n" + "\n".join(settings),
     ])  # fmt: skip
 
