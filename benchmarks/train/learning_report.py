@@ -33,8 +33,8 @@ rollouts and updates; reading the model, sampling reset states, compilation and 
 
 Settings are named by their difference from the present defaults; earlier trainings had other defaults, and no settings
 that came later. In chains, stages paid 5 in every later step until 2026-11-27. With `reward.completion 250` the end of
-the task was bootstrapped, as that of time is: the value of a block at rest went on. The six of the default settings had
-other work on the host's processors beside them.
+the task was bootstrapped, as that of time is: the value of a block at rest went on. Insertion had no finish until then.
+Chains with the default settings and insertions of seeds 34 to 49 had other work on the host's processors beside them.
 
 What the figures do not show: success in Reality ([Table 1](train_table1.md)), which varies strongly between seeds
 with equal success here. A training stops when its time is over, so that seconds on different hosts are not comparable.
