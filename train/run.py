@@ -23,9 +23,10 @@ from concent_warp.train.environment.worlds import check_worlds, make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Examination, Iteration, Report, Trainer
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
+from concent_warp.train.task.nominal_shapes import with_nominal_shapes
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.episodes import PolicyFunction
-from concent_warp.train.trials.stress import StressTest, with_shapes
+from concent_warp.train.trials.stress import StressTest
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
 CHANGEABLE = ("iterations", "checkpoint", "target", "capture", "fuse")
@@ -173,10 +174,11 @@ def train_run(
             if finishing:
                 cfg = replace(cfg, collision="full")
                 given = run.task(cfg)
-                if run.cfg.finish.physics == "shapes":
-                    given, stress = with_shapes(given, run.cfg.stress), run.cfg.stress
+                shaped = with_nominal_shapes(given) if run.cfg.finish.physics == "shapes" else None
+                if shaped is not None:
+                    given, constant = shaped, run.cfg.stress.time_constant
                     cfg = replace(cfg, stride=1)
-                    options = {"refine": steps_for(given, stress.time_constant), "time_constant": stress.time_constant}
+                    options = {"refine": steps_for(given, constant), "time_constant": constant}
             if buffers is not None:
                 cfg = replace(cfg, nconmax=buffers[0], njmax=buffers[1])
             return make_environment(given, cfg, states, device=device, seed=seed, **options)

@@ -4,7 +4,9 @@ import pytest
 import tyro
 
 import concent_warp as cw
-from concent_warp.cli.commands.train import Arguments, given_stage
+from concent_warp.cli.commands.train import Arguments, given_stage, status
+from concent_warp.train.cfg import FinishCfg
+from concent_warp.train.learning.ppo import Iteration
 
 GIVEN = ["demo.h5", "--model", "model.toml"]
 
@@ -35,3 +37,10 @@ def test_the_short_form_of_the_stage_has_precedence():
     assert given_stage(["--environment.stage", "pick", "--stage", "all"]) == "all"
     assert given_stage(["--stage", "pick", "--environment.stage", "all"]) == "pick"
     assert read("--stage", "pick", "--environment.stage", "all").ppo == cw.PpoCfg()
+
+
+def test_progress_says_when_a_training_finishes():
+    cfg = cw.TrainCfg(ppo=cw.PpoCfg(iterations=4), finish=FinishCfg(share=0.5))
+    said = [status(Iteration(k, 100 * k, 1.0, 0.5, 0.5, 50.0, {"success": 0.5}), cfg) for k in range(1, 9)]
+    assert [text.startswith("finish, ") for text in said] == [False, False, True, True] * 2
+    assert said[0] == "100 steps, success 50.0%, 50 steps/s"

@@ -117,6 +117,23 @@ def test_more_collides_in_the_last_iterations(made, monkeypatch, collision, fini
     assert found == expected
 
 
+def test_all_spheres_collide_in_the_last_iterations_where_the_scene_has_no_shapes(made, monkeypatch):
+    finish, made_with = FinishCfg(share=0.5), []
+
+    def make(task: Task, cfg, states, **options):
+        made_with.append((colliding(task), options.get("refine", 1), options.get("time_constant")))
+        return make_environment(task, cfg, states, **options)
+
+    monkeypatch.setattr("concent_warp.train.run.make_environment", make)
+    for shaped in (True, False):
+        if not shaped:
+            monkeypatch.setattr("concent_warp.train.run.with_nominal_shapes", lambda _: None)
+        train_run(replace(made, cfg=replace(made.cfg, finish=finish)), None, device="cpu")
+    assert made_with[:2] == [("events", 1, None), ("shapes", made_with[1][1], 0.004)]
+    assert made_with[1][1] * 0.004 >= 2 * made.model.scene.model.opt.timestep
+    assert made_with[2:] == [("events", 1, None), ("spheres", 1, None)]
+
+
 def colliding(task: Task) -> str:
     """Return what of the objects collides in a task's physics."""
     m, bodies = task.compiled, np.array(task.objects)

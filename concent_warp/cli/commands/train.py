@@ -88,6 +88,12 @@ def given_stage(options: Sequence[str]) -> str:
     return named.get("--stage", named.get("--environment.stage", LAST))
 
 
+def status(this: Iteration, cfg: TrainCfg) -> str:
+    """Return what the progress of a training says of an iteration, counted over all seeds."""
+    finishing = (this.iteration - 1) % cfg.ppo.iterations >= cfg.finish_from
+    return f"{'finish, ' * finishing}{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"
+
+
 def run(arguments: Arguments) -> Policy:
     """Train and write the run folder, one of several processes where torchrun started them."""
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
@@ -116,8 +122,7 @@ def run(arguments: Arguments) -> Policy:
         def progress(this: Iteration) -> None:
             nonlocal last
             last = this
-            text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"
-            update(this.iteration / total, text, this.seconds / this.iteration * (total - this.iteration))
+            update(this.iteration / total, status(this, cfg), this.seconds / this.iteration * (total - this.iteration))
 
         policy = train(
             model,
