@@ -83,11 +83,11 @@ class AnisotropicForce(ForceModel):
         """See `ForceModel.launch`."""
         import warp as wp
 
-        from concent_warp.kernels import force_models
+        from concent_warp.kernels import contact_force_models
 
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        force_models.add_anisotropic_friction(m, d, *self._device, values, FADE_SPEED)
+        contact_force_models.add_anisotropic_friction(m, d, *self._device, values, FADE_SPEED)
 
 
 class TurningForce(ForceModel):
@@ -154,11 +154,11 @@ class TurningForce(ForceModel):
         """See `ForceModel.launch`."""
         import warp as wp
 
-        from concent_warp.kernels import force_models
+        from concent_warp.kernels import contact_force_models
 
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        force_models.add_turning_friction(m, d, *self._device, values, SHARE_OF_STOP, rolling=self.rolling)
+        contact_force_models.add_turning_friction(m, d, *self._device, values, SHARE_OF_STOP, rolling=self.rolling)
 
 
 class AdhesionForce(ForceModel):
@@ -275,7 +275,7 @@ class AdhesionForce(ForceModel):
         """See `ForceModel.launch`."""
         import warp as wp
 
-        from concent_warp.kernels import force_models
+        from concent_warp.kernels import contact_force_models
 
         if self._device is None:
             self._device = (
@@ -284,7 +284,7 @@ class AdhesionForce(ForceModel):
                 wp.array(self.round, dtype=bool),
                 wp.array(self.still, dtype=int),
             )
-        force_models.add_adhesion(m, d, *self._device, values, self.gap)
+        contact_force_models.add_adhesion(m, d, *self._device, values, self.gap)
 
 
 def _outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:
