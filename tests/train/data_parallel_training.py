@@ -9,7 +9,7 @@ from small_insertion import SETTINGS, make_demonstration, make_events, make_mode
 
 from concent_warp.errors import TrainError
 from concent_warp.recording.recording import Recording
-from concent_warp.train.cfg import PpoCfg, TrainCfg
+from concent_warp.train.cfg import FinishCfg, PpoCfg, TrainCfg
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import Trainer
@@ -20,6 +20,8 @@ from concent_warp.train.run import TrainingRun, train_run
 SENSED = replace(SETTINGS, observation=ObservationCfg(), reset=replace(SETTINGS.reset, states=8))
 """Worlds that the policy observes through sensors."""
 PPO = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
+FINISH = FinishCfg(share=0.25)
+"""The last of four iterations, and none of two."""
 
 
 def make_run() -> TrainingRun:
@@ -27,7 +29,8 @@ def make_run() -> TrainingRun:
     demonstration = make_demonstration(model)
     environment = replace(SENSED, worlds=4)
     recording = Recording(model.scene.xml, (demonstration,))
-    return TrainingRun(model, recording, make_events(model, demonstration), TrainCfg(environment=environment, ppo=PPO))
+    cfg = TrainCfg(environment=environment, ppo=PPO, finish=FINISH)
+    return TrainingRun(model, recording, make_events(model, demonstration), cfg)
 
 
 def rounds(run: TrainingRun, count: int) -> TrainingRun:

@@ -350,11 +350,11 @@ class Trainer:
             return
         worlds = {name: value.cpu() for name, value in self.environment.state().items()}
         ranks = self.process.gather({"environment": worlds, "random": random_state(self.device)})
-        if not self.process.is_rank_zero:
-            return
         document = {**self.weights(), "learning_rate": self.algorithm.learning_rate, "ranks": ranks}
         document["buffers"] = self.environment.buffers
-        write_checkpoint(self.folder / CHECKPOINT, document)
+        with self.process.raise_together():  # no rank goes on, or resumes from the file, before it is written
+            if self.process.is_rank_zero:
+                write_checkpoint(self.folder / CHECKPOINT, document)
 
     def begin_with(self, weights: Mapping[str, Any], where: object = None) -> None:
         """Load the policy of a checkpoint, without value function, optimiser and environment.
