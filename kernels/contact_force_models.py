@@ -149,6 +149,29 @@ def add_adhesion(
     )
 
 
+@wp.func
+def own_geom(pair: wp.vec2i, moving: wp.array[bool], still: wp.array[bool]) -> int:
+    """Return which of two geoms is the body's where the other one stands still, else -1."""
+    if pair[0] < 0 or pair[1] < 0:
+        return -1
+    if moving[pair[1]] and still[pair[0]]:
+        return pair[1]
+    if moving[pair[0]] and still[pair[1]]:
+        return pair[0]
+    return -1
+
+
+@wp.func
+def normal_force(cone: int, condim: int, first: int, efc_force: wp.array[float]) -> float:
+    """Return the normal force of a contact [N]: a pyramid's edges each carry a share of it."""
+    pressed = efc_force[first]
+    rows = wp.where(cone == PYRAMIDAL and condim > 1, 2 * (condim - 1), 1)
+    for k in range(1, rows):
+        if first + k < efc_force.shape[0]:
+            pressed += efc_force[first + k]
+    return pressed
+
+
 @wp.kernel
 def anisotropic_kernel(
     cone: int,
@@ -199,23 +222,11 @@ def anisotropic_kernel(
     i = wp.tid()
     if i >= contacts[0]:
         return
-    first = address[i, 0]
-    pair = geom[i]
-    if first < 0 or condim[i] < 3 or pair[0] < 0 or pair[1] < 0:
+    mine = own_geom(geom[i], moving, still)
+    if address[i, 0] < 0 or condim[i] < 3 or mine < 0:
         return
-    mine = pair[1]
-    if not (moving[pair[1]] and still[pair[0]]):
-        mine = pair[0]
-        if not (moving[pair[0]] and still[pair[1]]):
-            return
-
     world = world_of[i]
-    pressed = efc_force[world, first]
-    rows = wp.where(cone == PYRAMIDAL, 2 * (condim[i] - 1), 1)
-    for k in range(1, rows):
-        if first + k < efc_force.shape[1]:
-            pressed += efc_force[world, first + k]
-
+    pressed = normal_force(cone, condim[i], address[i, 0], efc_force[world])
     body = body_of[mine]
     moved = cvel[world, body]
     velocity = wp.spatial_bottom(moved) + wp.cross(
@@ -277,23 +288,11 @@ def turning_kernel(
     i = wp.tid()
     if i >= contacts[0]:
         return
-    first = address[i, 0]
-    pair = geom[i]
-    if first < 0 or pair[0] < 0 or pair[1] < 0:
+    mine = own_geom(geom[i], moving, still)
+    if address[i, 0] < 0 or mine < 0:
         return
-    mine = pair[1]
-    if not (moving[pair[1]] and still[pair[0]]):
-        mine = pair[0]
-        if not (moving[pair[0]] and still[pair[1]]):
-            return
-
     world = world_of[i]
-    pressed = efc_force[world, first]
-    rows = wp.where(cone == PYRAMIDAL and condim[i] > 1, 2 * (condim[i] - 1), 1)
-    for k in range(1, rows):
-        if first + k < efc_force.shape[1]:
-            pressed += efc_force[world, first + k]
-
+    pressed = normal_force(cone, condim[i], address[i, 0], efc_force[world])
     body = body_of[mine]
     spin = wp.spatial_top(cvel[world, body])
     normal = wp.vec3(frame[i][0, 0], frame[i][0, 1], frame[i][0, 2])

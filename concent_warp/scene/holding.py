@@ -70,6 +70,6 @@ def _set_default(root: ElementTree.Element, name: str, value: str) -> None:
 
 def _same_joints(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
     """Return whether the friction of all joints has the same constants."""
-    rubbing = other.dof_frictionloss > 0
+    has_friction = other.dof_frictionloss > 0
     pairs = ((one.dof_solref, other.dof_solref), (one.dof_solimp, other.dof_solimp))
-    return all(np.array_equal(a[rubbing], b[rubbing]) for a, b in pairs)
+    return all(np.array_equal(a[has_friction], b[has_friction]) for a, b in pairs)

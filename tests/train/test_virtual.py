@@ -7,6 +7,7 @@ import pytest
 import torch
 from small_insertion import SETTINGS
 
+from concent_warp.errors import SceneError
 from concent_warp.scene.shapes.solid import Box
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.train.cfg import CollisionCfg
@@ -61,3 +62,16 @@ def test_points_tell_of_an_object_that_stands_in_another_where_its_spheres_do_no
     plain, pointed = penalty(0), penalty(300)
     assert (pointed <= plain + 1e-6).all()
     assert (pointed < plain - 0.01).any()
+
+
+def test_an_object_without_a_surface_needs_all_its_spheres_in_the_physics(task, states, monkeypatch):
+    def missing(_scene, body: str):
+        raise SceneError(f"body {body!r} has no geoms")
+
+    monkeypatch.setattr(Surface, "of_body", missing)
+    pointed = replace(SETTINGS, virtual=replace(SETTINGS.virtual, points=20))
+    with pytest.raises(SceneError):
+        make_environment(task, pointed, states, device="cpu")
+    whole = replace(task, collidable=np.ones_like(task.collidable))
+    environment = make_environment(whole, replace(pointed, collision="full"), states, device="cpu")
+    assert not environment._penalty.any()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.errors import SceneError
 from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.inset import inset
@@ -24,8 +25,8 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
 
     Spheres of an object outside the physics are penalised near the surfaces of the other objects and of the robot's
     links, and points of its surface inside the other objects: spheres round off edges, so that an object that slides
-    over such an edge in the simulation would catch on a sharp one. The margin band does not apply to bodies that touch
-    in the stage's target event.
+    over such an edge in the simulation would catch on a sharp one. An object without a surface has neither, and must
+    have all its spheres in the physics. The margin band does not apply to bodies that touch in the target event.
 
     Args:
         task: The task.
@@ -38,10 +39,15 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     sets, points = [], []
     stages = task.table.used.shape[0]
     for body in geometry.bodies:
-        surface = Surface.of_body(task.model.scene, body)
+        left = geometry.of(body)[~task.collidable[geometry.of(body)]]
+        try:
+            surface = Surface.of_body(task.model.scene, body)
+        except SceneError:
+            if len(left):
+                raise
+            continue  # all its spheres are in the physics
         if cfg.points:
             points.append(SphereSet(m.body(body).id, _surface_points(surface, cfg), np.zeros(cfg.points)))
-        left = geometry.of(body)[~task.collidable[geometry.of(body)]]
         if len(left):
             covered = _within(surface, geometry.position[left], geometry.radius[left], cfg.slack)
             sets.append(SphereSet(m.body(body).id, *covered))

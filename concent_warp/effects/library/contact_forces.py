@@ -1,9 +1,9 @@
-"""Forces at surfaces beside MuJoCo's contacts: friction of a surface with a grain, adhesion."""
+"""Forces at surfaces beside MuJoCo's contacts: friction of a surface with a grain or against rotation, adhesion."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -26,11 +26,8 @@ SHARE_OF_STOP = 4.0
 """Contacts that together stop a turning body in one step at most [-]: the corners of a box, four points of a rim."""
 
 
-class AnisotropicForce(ForceModel):
-    """-(ratio - 1) mu N v_y / sqrt(|v|^2 + v0^2) along y at each contact of a body with what stands still.
-
-    v is the sliding velocity [m/s], N the normal force [N] of the step before. The parameter is the ratio, shape (1,).
-    """
+class ContactForce(ForceModel):
+    """A force at each contact of a body with what stands still."""
 
     def __init__(self, m: mujoco.MjModel, bodies: np.ndarray) -> None:
         """Act on the contacts of some bodies, ids of shape (n,)."""
@@ -40,31 +37,54 @@ class AnisotropicForce(ForceModel):
         self.still[static_geoms(m)] = True
         self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
 
+    def contacts(self, m: mujoco.MjModel, d: mujoco.MjData) -> Callable[[], Iterator[tuple[int, int, int, float]]]:
+        """Return a function that yields the present contacts: index, dimension, body and normal force [N]."""
+        moving, still, body_of = self.moving.tolist(), self.still.tolist(), m.geom_bodyid.tolist()
+        elliptic = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+
+        def present() -> Iterator[tuple[int, int, int, float]]:
+            if not d.ncon:
+                return
+            # A handful of contacts: plain numbers are several times faster than arrays of them.
+            pairs, address, dims = (v.tolist() for v in (d.contact.geom, d.contact.efc_address, d.contact.dim))
+            for i, (first, second) in enumerate(pairs):
+                geom = first if moving[first] and still[second] else second if moving[second] and still[first] else -1
+                if geom < 0 or address[i] < 0:
+                    continue
+                # A pyramid's edges each carry a share of the normal force.
+                rows = 1 if elliptic or dims[i] == 1 else 2 * (dims[i] - 1)
+                yield i, dims[i], body_of[geom], sum(d.efc_force[address[i] : address[i] + rows].tolist())
+
+        return present
+
+    def on_device(self) -> tuple[wp.array[Any], wp.array[Any]]:
+        """Return which geoms are the body's and which stand still, on the device."""
+        import warp as wp
+
+        if self._device is None:
+            self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
+        return self._device
+
+
+class AnisotropicForce(ContactForce):
+    """-(ratio - 1) mu N v_y / sqrt(|v|^2 + v0^2) along y at each contact of a body with what stands still.
+
+    v is the sliding velocity [m/s], N the normal force [N] of the step before. The parameter is the ratio, shape (1,).
+    """
+
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """See `ForceModel.bound`."""
         extra = float(values[0]) - 1.0
         if not extra:
             return lambda: None
-        moving, still, body_of = self.moving.tolist(), self.still.tolist(), m.geom_bodyid.tolist()
-        root_of = m.body_rootid.tolist()
-        elliptic = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+        contacts, root_of = self.contacts(m, d), m.body_rootid.tolist()
         twist, middle, about, applied = d.cvel, d.xipos, d.subtree_com, d.xfrc_applied
 
         def act() -> None:
-            if not d.ncon:
-                return
-            # A handful of contacts: plain numbers are several times faster than arrays of them.
             contact = d.contact
-            pairs, address = contact.geom.tolist(), contact.efc_address.tolist()
-            for i, (first, second) in enumerate(pairs):
-                geom = first if moving[first] and still[second] else second if moving[second] and still[first] else -1
-                dim = int(contact.dim[i])
-                if geom < 0 or dim < 3 or address[i] < 0:
+            for i, dim, body, load in contacts():
+                if dim < 3:
                     continue
-                # A pyramid's edges each carry a share of the normal force.
-                rows = 1 if elliptic else 2 * (dim - 1)
-                load = sum(d.efc_force[address[i] : address[i] + rows].tolist())
-                body = body_of[geom]
                 (px, py, pz), (nx, ny, nz) = contact.pos[i].tolist(), contact.frame[i, :3].tolist()
                 wx, wy, wz, vx, vy, vz = twist[body].tolist()
                 cx, cy, cz = about[root_of[body]].tolist()
@@ -81,16 +101,12 @@ class AnisotropicForce(ForceModel):
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `ForceModel.launch`."""
-        import warp as wp
-
         from concent_warp.kernels import contact_force_models
 
-        if self._device is None:
-            self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        contact_force_models.add_anisotropic_friction(m, d, *self._device, values, FADE_SPEED)
+        contact_force_models.add_anisotropic_friction(m, d, *self.on_device(), values, FADE_SPEED)
 
 
-class TurningForce(ForceModel):
+class TurningForce(ContactForce):
     """A torque -min(c N, I w / (4 dt)) against turning about the normal, or across it, at each contact of a body.
 
     The contacts are those with what stands still; N is the normal force [N] of the step before, w the rate [rad/s], I
@@ -100,38 +116,22 @@ class TurningForce(ForceModel):
 
     def __init__(self, m: mujoco.MjModel, bodies: np.ndarray, *, rolling: bool) -> None:
         """Act on the contacts of some bodies, ids of shape (n,), against rolling or against turning in place."""
+        super().__init__(m, bodies)
         self.rolling = rolling
-        self.moving = np.zeros(m.ngeom, dtype=bool)
-        self.moving[np.isin(m.geom_bodyid, bodies)] = True
-        self.still = np.zeros(m.ngeom, dtype=bool)
-        self.still[static_geoms(m)] = True
-        self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """See `ForceModel.bound`."""
         coefficient = float(values[0])
         if coefficient <= 0:
             return lambda: None
-        moving, still, body_of = self.moving.tolist(), self.still.tolist(), m.geom_bodyid.tolist()
-        elliptic, rolling = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, self.rolling
+        contacts, rolling = self.contacts(m, d), self.rolling
         stop = 1 / (SHARE_OF_STOP * m.opt.timestep)
         least = np.maximum(m.body_inertia, mujoco.mjMINVAL).tolist()
         twist, axes, applied = d.cvel, d.ximat, d.xfrc_applied
 
         def act() -> None:
-            if not d.ncon:
-                return
             contact = d.contact
-            pairs, address = contact.geom.tolist(), contact.efc_address.tolist()
-            for i, (first, second) in enumerate(pairs):
-                geom = first if moving[first] and still[second] else second if moving[second] and still[first] else -1
-                if geom < 0 or address[i] < 0:
-                    continue
-                dim = int(contact.dim[i])
-                # A pyramid's edges each carry a share of the normal force.
-                rows = 1 if elliptic or dim == 1 else 2 * (dim - 1)
-                load = sum(d.efc_force[address[i] : address[i] + rows].tolist())
-                body = body_of[geom]
+            for i, _, body, load in contacts():
                 (nx, ny, nz), (wx, wy, wz) = contact.frame[i, :3].tolist(), twist[body, :3].tolist()
                 about = nx * wx + ny * wy + nz * wz
                 ax, ay, az = about * nx, about * ny, about * nz
@@ -152,13 +152,9 @@ class TurningForce(ForceModel):
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `ForceModel.launch`."""
-        import warp as wp
-
         from concent_warp.kernels import contact_force_models
 
-        if self._device is None:
-            self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        contact_force_models.add_turning_friction(m, d, *self._device, values, SHARE_OF_STOP, rolling=self.rolling)
+        contact_force_models.add_turning_friction(m, d, *self.on_device(), values, SHARE_OF_STOP, rolling=self.rolling)
 
 
 class AdhesionForce(ForceModel):

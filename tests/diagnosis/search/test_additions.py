@@ -15,6 +15,18 @@ from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.made_up import FINER, GIVEN, finding, node, procedure
 
 
+def one_after_the_other(made, nodes):
+    """Return a search that finds and records an effect at each step, fitted as the next node."""
+
+    def find(_base, step, **_):
+        made.record.groups.append((f"effect {step}",))
+        made.record.hypotheses.append({})
+        made.record.findings.append(finding(f"effect {step}", 0.6, accepted=True, step=step))
+        return nodes[step + 1], ()
+
+    return find
+
+
 def test_noise_that_may_be_larger_than_its_estimate_ends_the_search(monkeypatch):
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
     monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
@@ -48,18 +60,12 @@ def test_an_effect_beside_others_must_explain_more_than_a_correction_of_these(
 ):
     made, nodes = procedure(), [node(3.0), node(1.3, effects=1), node(1.0, effects=2)]
 
-    def find(_base, step, **_):
-        made.record.groups.append((f"effect {step}",))
-        made.record.hypotheses.append({})
-        made.record.findings.append(finding(f"effect {step}", 0.6, accepted=True, step=step))
-        return nodes[step + 1], ()
-
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
     monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
     monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
     monkeypatch.setattr(additions, "with_interleaved_folds", lambda one: one)
-    monkeypatch.setattr(made.additions.finder, "find", find)
+    monkeypatch.setattr(made.additions.finder, "find", one_after_the_other(made, nodes))
     errors = None if corrected is None else np.array([corrected / 2] * 2)
     monkeypatch.setattr(made.additions, "_correction", lambda one, _first: None if one is nodes[0] else errors)
     monkeypatch.setattr(made.additions, "_explains_more", lambda *_: explains_more)
@@ -87,17 +93,11 @@ def test_a_small_remainder_is_not_explained_by_a_size_far_beyond_typical_ones(mo
     nodes[1].prediction = lambda _effect: SimpleNamespace(owned=1, parameters=(typical, typical))
     nodes[2].fit.values = np.array([9.0, size * typical.scale])
 
-    def find(_base, step, **_):
-        made.record.groups.append((f"effect {step}",))
-        made.record.hypotheses.append({})
-        made.record.findings.append(finding(f"effect {step}", 0.9, accepted=True, step=step))
-        return nodes[step + 1], ()
-
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
     monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
     monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
-    monkeypatch.setattr(made.additions.finder, "find", find)
+    monkeypatch.setattr(made.additions.finder, "find", one_after_the_other(made, nodes))
     assert made.additions.add_effects(nodes[:1], ())[0] == nodes[: 2 + added]
     assert made.record.findings[1].accepted is added
     assert ("far beyond typical" in made.record.findings[1].reason) is not added
