@@ -44,6 +44,8 @@ WORLD_OF_TRIALS = WorldCfg(timestep=5e-4, integrator="Euler")
 """Reality as policies are tried in it: shorter steps and another integrator than the model's."""
 TASKS: dict[str, Task] = {"shape_sorter": ShapeSorterCfg(), "round_peg": RoundPegCfg(), "stacking": StackingCfg()}
 MODEL, DEMONSTRATION, WORLD = "model.toml", "demonstration.h5", "hidden.txt"
+ATTEMPTS = 10
+"""Demonstrations of a seed that are recorded until one succeeds."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,13 @@ class Case:
     """Whether an effect is hidden where the demonstration is recorded and the policy is tried."""
     added: bool = False
     """Whether the model has the effect, fitted to the demonstration, before its geometry is fitted."""
+    randomised: bool = False
+    """Whether the model has the effect with an interval that nothing was fitted to: it only is known to be possible."""
 
     def material(self, seed: int) -> str:
         """Return the name of the folder of model and demonstration."""
-        return "_".join([self.geometry, *(["hidden"] * (self.world == "hidden")), *(["added"] * self.added), str(seed)])
+        marks = ["hidden"] * (self.world == "hidden") + ["added"] * self.added + ["randomised"] * self.randomised
+        return "_".join([self.geometry, *marks, str(seed)])
 
 
 CASES = {
@@ -72,6 +77,7 @@ CASES = {
     "unconstrained": Case("unconstrained", "surface", "engineered"),
     "unaware": Case("ours, an effect hidden", world="hidden"),
     "aware": Case("ours, the hidden effect added", world="hidden", added=True),
+    "randomised": Case("ours, the hidden effect randomised", world="hidden", randomised=True),
 }
 
 
@@ -88,6 +94,8 @@ class Args:
     """What is demonstrated."""
     hidden: str = HIDDEN
     """Effect that is hidden, with its magnitude."""
+    spread: tuple[float, float] = (0.0, 0.3)
+    """95 % interval of the effect's main parameter where it is only known to be possible."""
     spheres: int = 512
     edges: int = 0
     """Further, smaller spheres along edges."""
@@ -95,14 +103,23 @@ class Args:
 
 
 def demonstrate(seed: int, hidden: tuple[str, ...], task: Task) -> Recording:
-    """Return a demonstration of Reality, with these effects hidden in it."""
+    """Return the first successful demonstration of a seed in Reality, with these effects hidden in it.
+
+    Raises:
+        SystemExit: None succeeds.
+    """
     cfg = RealityCfg(world=WORLD_OF_TRIALS)
     effects = ()
     if hidden:
         fingers = task.robot.gripper_actuators
         world = TaskWorld(task.build(), cfg.world, task.objects[0], fingers, parse_effects(hidden))
         effects = tuple(one.effect for one in world.hidden())
-    return record(cfg, [1000 * seed], task=task, effects=effects, variation=VariationCfg())[0]
+    for number in range(ATTEMPTS):
+        found = record(cfg, [1000 * seed + number], task=task, effects=effects, variation=VariationCfg())[0]
+        if found[0].success:
+            return found
+    what = " ".join(hidden) or "nothing"
+    raise SystemExit(f"seed {seed}: none of {ATTEMPTS} demonstrations succeeds with {what} hidden")
 
 
 def make(case: Case, seed: int, args: Args) -> None:
@@ -112,6 +129,12 @@ def make(case: Case, seed: int, args: Args) -> None:
     if folder.exists():
         return
     quiet_warp()
+    if case.randomised:
+        unaware = replace(case, randomised=False)
+        make(unaware, seed, args)
+        model, recording = material(args.out, unaware, seed)
+        keep(folder, with_spread(model, hidden, args.spread), recording, hidden)
+        return
     recording = demonstrate(seed, (hidden,) if hidden else (), TASKS[args.task])
     scene = Scene(recording.scene)
     placement = "surface" if case.geometry == "surface" else "inset"
@@ -127,6 +150,23 @@ def make(case: Case, seed: int, args: Args) -> None:
             print(f"{folder.name}: {added.effect.name} {added.values} {added.intervals}", flush=True)
     if case.geometry == "fitted":
         model = fit_geometry(model, recording, replace(args.fit, seed=seed), engine="mujoco").model
+    keep(folder, model, recording, hidden)
+
+
+def with_spread(model: Model, hidden: str, spread: tuple[float, float]) -> Model:
+    """Return a model with the effect on all its targets, its main parameter in the middle of an interval."""
+    kind = effect_class(hidden.split("=")[0])
+    for names in kind.targets(Model(model.scene).compile()):
+        model = model.add(kind(*names))
+        added = model.effects[-1]
+        values = sum(spread) / 2, *added.values[1:]
+        uncertain = replace(added, values=values, intervals=(spread, *((value, value) for value in values[1:])))
+        model = replace(model, effects=(*model.effects[:-1], uncertain))
+    return model
+
+
+def keep(folder: Path, model: Model, recording: Recording, hidden: str) -> None:
+    """Write model and demonstration in one piece or not at all."""
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

@@ -33,6 +33,7 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun
+from concent_warp.train.task.holding import holding_leads
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.evaluate import run_episodes, wilson
 
@@ -152,7 +153,10 @@ def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL) -> R
     task, shown = run.task(), judge.task()
     states = judge.evaluation_states(shown, args.episodes, seed)
     # A model in which the demonstration does not get as far has fewer stages.
-    starts = replace(states, stage=np.clip(states.stage, task.first, task.stage))
+    starts = replace(states, stage=np.clip(states.stage, task.first, task.stage), ctrl=states.ctrl.copy())
+    # The robot is held in them by the commands that the policy's own model takes for right.
+    arm = task.robot.actuator
+    starts.ctrl[:, arm] += leads(task, states.qpos) - leads(shown, states.qpos)
     torch.manual_seed(seed)
     hide = hidden(args, name)
     # Each model has contact points of its own to tell a lost block by; here its place at the end tells.
@@ -174,6 +178,11 @@ def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL) -> R
         "machine": machine(), "trained_on": result["machine"], "settings": changed(result["settings"]),
         "setpoint_lead_scale": args.setpoint_lead_scale,
     }  # fmt: skip
+
+
+def leads(task: Task, qpos: np.ndarray) -> np.ndarray:
+    """Return by how much a task's model has commands lead the arm's joints to hold it at positions (R, nq)."""
+    return holding_leads(task.compiled, mujoco.MjData(task.compiled), task.robot.actuator, qpos)
 
 
 def targets_met(task: Task, environment: Environment, qpos: np.ndarray, mocap: np.ndarray) -> int:

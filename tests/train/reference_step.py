@@ -110,12 +110,8 @@ class Reference:
         action = np.clip(action, -1, 1)
         for k, actuator in enumerate(robot.actuator):
             hinge = self.m.jnt_type[robot.joint[k]] == mujoco.mjtJoint.mjJNT_HINGE
-            step, lead = (
-                (self.cfg.action.turn, self.cfg.action.turn_lead)
-                if hinge
-                else (self.cfg.action.slide, self.cfg.action.slide_lead)
-            )
-            at = state.qpos[robot.qpos[k]]
+            step, lead = self.cfg.action.turn if hinge else self.cfg.action.slide, robot.lead[k]
+            at = state.qpos[robot.qpos[k]] + robot.hold[k]
             ctrl[actuator] = np.clip(ctrl[actuator] + action[k] * step, at - lead, at + lead)
         for actuator in robot.gripper:
             ctrl[actuator] += action[-1] * self.cfg.action.gripper
@@ -148,7 +144,7 @@ class Reference:
         angles = state.qpos[robot.qpos[hinge]]
         parts = [np.sin(angles), np.cos(angles), state.qpos[robot.qpos[slide]], state.qvel[robot.dof]]
         if self.cfg.observation.leads:
-            parts.append((state.ctrl[robot.actuator] - state.qpos[robot.qpos]) / robot.lead)
+            parts.append((state.ctrl[robot.actuator] - state.qpos[robot.qpos] - robot.hold) / robot.lead)
         if len(robot.gripper):
             driven = [self.m.jnt_qposadr[self.m.actuator_trnid[i, 0]] for i in robot.gripper]
             parts += [[state.qpos[driven].mean()], [state.ctrl[robot.gripper].mean()]]
@@ -262,7 +258,7 @@ class Reference:
                 success = worst < cfg.success
             else:
                 success = bool((np.abs(self.relative(d) - task.target_position) < cfg.success).all())
-            lead = ctrl[task.robot.actuator] - after.qpos[task.robot.qpos]
+            lead = ctrl[task.robot.actuator] - after.qpos[task.robot.qpos] - task.robot.hold
             terms |= {
                 "reach": reward.reach * self.reach(d, stage),
                 "stages": reward.stage * (stage - task.first),

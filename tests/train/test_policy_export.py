@@ -100,7 +100,7 @@ def test_commands_follow_from_metadata_alone(trained, tmp_path):
         command = ctrl[:, column] + part["scale"] * action[:, i]
         if part["lead"] is not None:
             at = qpos[:, m.joint(part["joint"]).qposadr[0]]
-            command = np.clip(command, at - part["lead"], at + part["lead"])
+            command = np.clip(command, at + part["hold"] - part["lead"], at + part["hold"] + part["lead"])
         if part["limits"] is not None:
             command = np.clip(command, *part["limits"])
         np.testing.assert_allclose(environment.physics.ctrl[:, column], command, atol=1e-6)

@@ -149,7 +149,7 @@ class Environment(VecEnv):
 
         self._arm, self._arm_qpos, self._arm_dof = index(robot.actuator), index(robot.qpos), index(robot.dof)
         self._gripper = index(robot.gripper)
-        self._step, self._lead = real(robot.step), real(robot.lead)
+        self._step, self._lead, self._hold = real(robot.step), real(robot.lead), real(robot.hold)
         ranges = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-np.inf, np.inf])
         self._range = real(ranges)
         self._objects = index(list(task.objects))
@@ -360,7 +360,7 @@ class Environment(VecEnv):
             copy.copy_(value)
         joints = len(self._arm)
         moved = p.ctrl[:, self._arm] + action[:, :joints] * self._step[:joints]
-        at = p.qpos[:, self._arm_qpos].float()
+        at = p.qpos[:, self._arm_qpos].float() + self._hold
         moved = torch.clamp(moved, at - self._lead, at + self._lead)
         p.ctrl[:, self._arm] = moved.clamp(self._range[self._arm, 0], self._range[self._arm, 1])
         if len(self._gripper):
@@ -416,7 +416,7 @@ class Environment(VecEnv):
             self.success.copy_((self._worst < self._max_deviation) & valid)
         else:
             self.success.copy_(((self.relative_position() - self._target).abs() < self._max_deviation).all(dim=1))
-        lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float()) / self._lead
+        lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float() - self._hold) / self._lead
         effort = effort_penalties(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
         disturb = disturbance_penalty(cfg, self._pose_before, self._object_poses())
         reaching, before = cfg.reach * self._reaching(), (self.stage - self.task.first).float()

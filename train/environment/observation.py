@@ -92,6 +92,7 @@ class BaseObservation:
         self._gripper = index(robot.gripper)
         self._opening = torch.as_tensor(robot.opening, dtype=torch.float32, device=device)
         self._lead = torch.as_tensor(robot.lead, dtype=torch.float32, device=device) if cfg.leads else None
+        self._hold = torch.as_tensor(robot.hold, dtype=torch.float32, device=device)
         self._tool = robot.tool
         self._objects = index(list(task.objects))
 
@@ -101,7 +102,7 @@ class BaseObservation:
         turned = qpos[:, self._hinges]
         parts = [turned.sin(), turned.cos(), qpos[:, self._slides], state.qvel[:, self._dofs].float()]
         if self._lead is not None:
-            parts.append((ctrl[:, self._actuators] - qpos[:, self._arm]) / self._lead)
+            parts.append((ctrl[:, self._actuators] - qpos[:, self._arm] - self._hold) / self._lead)
         if len(self._gripper):
             parts += [
                 (qpos * self._opening).sum(dim=1, keepdim=True),

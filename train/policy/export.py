@@ -172,7 +172,7 @@ def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
         "joint angles": ("sines of all angles, then their cosines", hinges),
         "joint positions": ("positions [m]", slides),
         "joint velocities": ("velocities [rad/s or m/s]", joints),
-        "command leads": ("command minus joint position, relative to the largest lead", joints),
+        "command leads": ("command minus joint position minus hold, relative to lead", joints),
         "gripper opening": ("opening as measured, see gripper", []),
         "gripper command": (f"mean command of the gripper's actuators [{unit}]", []),
         "end effector": ("position [m], world frame", [m.site(robot.tool).name]),
@@ -243,7 +243,8 @@ def _described_action(task: Task) -> dict[str, Any]:
     for i, (actuator, joint) in enumerate(zip(robot.actuator, robot.joint, strict=True)):
         row = {"name": m.actuator(actuator).name, "joint": m.joint(joint).name}
         row |= {"unit": "rad" if robot.turning[i] else "m", "scale": float(robot.step[i])}
-        rows.append(row | {"limits": _limits(task, int(actuator)), "lead": float(robot.lead[i])})
+        row |= {"limits": _limits(task, int(actuator)), "hold": float(robot.hold[i]), "lead": float(robot.lead[i])}
+        rows.append(row)
     if len(robot.gripper):
         names = [m.actuator(a).name for a in robot.gripper]
         unit = "m" if robot.in_metres else COMMAND_UNIT
@@ -253,8 +254,9 @@ def _described_action(task: Task) -> dict[str, Any]:
         "output": OUTPUT,
         "size": robot.actions,
         "range": [-1.0, 1.0],
-        "meaning": "once a control period: command += scale * action; then the command is kept within lead of the "
-        "joint's measured position where there is a lead, then within limits; it is constant until the next",
+        "meaning": "once a control period: command += scale * action; then, where there is a lead, the command minus "
+        "hold is kept within lead of the joint's measured position; then it is kept within limits; it is constant "
+        "until the next. Start from a command that holds the robot",
         "parts": rows,
     }
 

@@ -14,6 +14,7 @@ from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.inverse_kinematics import solve_inverse_kinematics
 from concent_warp.train.resets.inverse_kinematics_batch import solve_inverse_kinematics_batch
+from concent_warp.train.task.holding import holding_commands
 from concent_warp.train.task.movable_fixtures import mocap_id
 from concent_warp.train.task.task import Task
 
@@ -204,9 +205,9 @@ class ResetSampler:
         if not candidate.as_demonstrated and self.overlap(candidate) > self.cfg.overlap:
             self.discard(candidate, "overlapping")
             return None
-        # Demonstrated commands differ from the joints by lag and contact forces; at rest they equal the joints.
+        # Demonstrated commands differ from the joints by lag and contact forces as well.
         robot = self.task.robot
-        candidate.ctrl[robot.actuator] = np.clip(candidate.qpos[robot.qpos], *self.command_limits(robot.actuator))
+        (candidate.ctrl[robot.actuator],) = holding_commands(self.m, self.d, robot.actuator, candidate.qpos[None])
         settled = self.settled_state(candidate)
         if settled is None:
             self.discard(candidate, "chain broken")
@@ -216,12 +217,6 @@ class ResetSampler:
         """Count a candidate that is discarded."""
         del candidate
         self.discarded[reason] += 1
-
-    def command_limits(self, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and upper limits of commands, shape of `actuators`; infinite without limits."""
-        limited = self.m.actuator_ctrllimited[actuators].astype(bool)
-        low, high = self.m.actuator_ctrlrange[actuators].T
-        return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
     def case(self, time: float) -> int:
         """Return the case of a demonstrated time [s], 1..3."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from concent_warp.effects.select import SINGLE, driven_joints, servo_gain
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import ActionCfg
+from concent_warp.train.task.holding import holding_leads
 
 JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 DYNAMICS = mujoco.mjtDyn
@@ -40,7 +41,10 @@ class Robot:
     step: np.ndarray
     """Largest step of each command of the action, shape (A,), A = J, and one more with a gripper."""
     lead: np.ndarray
-    """Largest difference of each arm command and its joint, shape (J,)."""
+    """Largest difference of each arm command and its joint beyond `hold`, shape (J,)."""
+    hold: np.ndarray
+    """Difference of each arm command and its joint with which the servos hold the arm against gravity, the middle of
+    the range along the demonstration, shape (J,); 0 where gravity is compensated."""
     in_metres: bool = True
     """Whether the gripper's commands are lengths [m], as of fingers that slide; else they are in a unit of its own."""
 
@@ -92,8 +96,18 @@ class Robot:
             tool=tool,
             step=np.append(np.where(turning, cfg.turn, cfg.slide), [step] * bool(gripper)),
             lead=np.where(turning, cfg.turn_lead, cfg.slide_lead),
+            hold=np.zeros(len(joint)),
             in_metres=in_metres,
         )
+
+    def holding(self, m: mujoco.MjModel, qpos: np.ndarray) -> Robot:
+        """Return the robot with leads counted from the commands that hold it at positions (K, nq).
+
+        Where these commands differ along the way, leads are larger by half of their range.
+        """
+        leads = holding_leads(m, mujoco.MjData(m), self.actuator, qpos)
+        low, high = leads.min(axis=0), leads.max(axis=0)
+        return replace(self, hold=(low + high) / 2, lead=self.lead + (high - low) / 2)
 
 
 def _check_servo(m: mujoco.MjModel, i: int) -> None:

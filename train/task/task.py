@@ -24,6 +24,9 @@ from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.slots import slot_table
 from concent_warp.train.task.stages import DemonstratedStages, demonstrated_stages
 
+REPLAY_STRIDE = 4
+"""Steps of a replay of which one is looked at."""
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -129,7 +132,7 @@ class Task:
             compiled=compiled,
             collidable=collidable,
             replay=replay,
-            robot=Robot.of(compiled, cfg.action),
+            robot=Robot.of(compiled, cfg.action).holding(compiled, _trained_positions(replay, events, first, stage)),
             objects=objects,
             table=table,
             robot_slots=robot_slots,
@@ -187,6 +190,12 @@ def _unstaged(events: ContactEventSequence) -> str:
     return f"{', '.join(shown[:4])}{' and more' if len(shown) > 4 else ''}" or "no contacts"
 
 
+def _trained_positions(replay: Replay, events: ContactEventSequence, first: int, stage: int) -> np.ndarray:
+    """Return positions of a replay (K, nq) from the start of the stage before the first trained one to its end."""
+    begin = events.stages[first - 1].start if first else 0.0
+    return replay.qpos[replay.row(begin) : replay.row(events.stages[stage].event.time) + 1 : REPLAY_STRIDE]
+
+
 def _objects_by_handling(model: Model, events: ContactEventSequence) -> list[str]:
     """Return the names of the objects, in descending order of the time for which robot links touch them."""
     assert model.geometry is not None
@@ -213,7 +222,7 @@ def _replay(m: mujoco.MjModel, model: Model, demonstration: Demonstration, colli
         raise TrainError("the replay of the demonstration diverges", where=demonstration.name)
     d = mujoco.MjData(m)
     contacts = constraints = 0
-    for k in range(0, steps, 4):
+    for k in range(0, steps, REPLAY_STRIDE):
         d.qpos[:], d.qvel[:], d.ctrl[:] = rollout.qpos[0][k], rollout.qvel[0][k], ctrl[k]
         mujoco.mj_forward(m, d)
         contacts, constraints = max(contacts, d.ncon), max(constraints, d.nefc)
