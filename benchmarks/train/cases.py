@@ -25,7 +25,7 @@ from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
 from concent_warp.reality.expert.plan import Task
 from concent_warp.reality.hidden.in_task import TaskWorld, parse_effects
-from concent_warp.reality.record import RealityCfg, record
+from concent_warp.reality.record import RealityCfg, Truth, record
 from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -102,8 +102,8 @@ class Args:
     fit: FitCfg = field(default_factory=FitCfg)
 
 
-def demonstrate(seed: int, hidden: tuple[str, ...], task: Task) -> Recording:
-    """Return the first successful demonstration of a seed in Reality, with these effects hidden in it.
+def demonstrate(seed: int, hidden: tuple[str, ...], task: Task) -> tuple[Recording, Truth]:
+    """Return the first successful demonstration of a seed in Reality, with these effects hidden in it, and its truth.
 
     Raises:
         SystemExit: None succeeds.
@@ -115,9 +115,9 @@ def demonstrate(seed: int, hidden: tuple[str, ...], task: Task) -> Recording:
         world = TaskWorld(task.build(), cfg.world, task.objects[0], fingers, parse_effects(hidden))
         effects = tuple(one.effect for one in world.hidden())
     for number in range(ATTEMPTS):
-        found = record(cfg, [1000 * seed + number], task=task, effects=effects, variation=VariationCfg())[0]
-        if found[0].success:
-            return found
+        found, (truth,) = record(cfg, [1000 * seed + number], task=task, effects=effects, variation=VariationCfg())
+        if truth.success:
+            return found, truth
     what = " ".join(hidden) or "nothing"
     raise SystemExit(f"seed {seed}: none of {ATTEMPTS} demonstrations succeeds with {what} hidden")
 
@@ -135,7 +135,7 @@ def make(case: Case, seed: int, args: Args) -> None:
         model, recording = material(args.out, unaware, seed)
         keep(folder, with_spread(model, hidden, args.spread), recording, hidden)
         return
-    recording = demonstrate(seed, (hidden,) if hidden else (), TASKS[args.task])
+    recording, _ = demonstrate(seed, (hidden,) if hidden else (), TASKS[args.task])
     scene = Scene(recording.scene)
     placement = "surface" if case.geometry == "surface" else "inset"
     spheres = ContactGeometryCfg(count=args.spheres, edges=args.edges, placement=placement, seed=seed)

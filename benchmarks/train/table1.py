@@ -32,6 +32,7 @@ from concent_warp.reality.world import WorldCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
+from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.holding import holding_leads
 from concent_warp.train.task.task import Task
@@ -142,8 +143,16 @@ def reference(case: Case) -> str:
     return "ours" if case.world == "plain" else "unaware"
 
 
-def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL) -> Row:
-    """Run a policy in Reality, by default in one that it knows and observes exactly."""
+def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL, states: ResetStates | None = None) -> Row:
+    """Run a policy in Reality, by default in one that it knows and observes exactly.
+
+    Args:
+        args: Where the policy is, episodes and what is hidden.
+        name: Case.
+        seed: Seed of the policy.
+        world: Reality.
+        states: Initial states; by default those of the case that is the reference.
+    """
     quiet_warp()
     torch.set_num_threads(1)
     case, folder = CASES[name], policy_folder(args, name, seed)
@@ -151,7 +160,7 @@ def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL) -> R
     run = policy.run
     judge = TrainingRun.load(policy_folder(args, reference(case), seed))
     task, shown = run.task(), judge.task()
-    states = judge.evaluation_states(shown, args.episodes, seed)
+    states = judge.evaluation_states(shown, args.episodes, seed) if states is None else states
     # A model in which the demonstration does not get as far has fewer stages.
     starts = replace(states, stage=np.clip(states.stage, task.first, task.stage), ctrl=states.ctrl.copy())
     # The robot is held in them by the commands that the policy's own model takes for right.

@@ -34,11 +34,11 @@ def test_a_demonstration_that_fails_is_recorded_again(script, monkeypatch):
 
     def record(_cfg, seeds, **_given):
         asked.extend(seeds)
-        return [[SimpleNamespace(success=seeds[0] == fine)]]
+        return seeds, [SimpleNamespace(success=seeds[0] == fine)]
 
     monkeypatch.setattr(cases, "record", record)
     fine = 7002
-    assert cases.demonstrate(7, (), ShapeSorterCfg())[0].success
+    assert cases.demonstrate(7, (), ShapeSorterCfg())[0] == [fine]
     assert asked == [7000, 7001, 7002]
     fine = None
     with pytest.raises(SystemExit, match="none of 10 demonstrations succeeds with nothing hidden"):

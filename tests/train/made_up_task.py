@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.sequence import ContactEvent, ContactEventSequence, ContactPair, Entity, Stage
+from concent_warp.events.sequence import ContactEvent, ContactEventSequence, ContactInterval, ContactPair, Entity, Stage
 from concent_warp.kernels.contact_pairs import PairTable
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -131,7 +131,8 @@ def make_events() -> ContactEventSequence:
         for k, name in enumerate(STAGES)
     )
     entities = (Entity("block_sphere0", "object", "block", 0), Entity("hand", "robot", "hand"))
-    return ContactEventSequence("demo", 0.02, 150, StagingCfg(), entities, (), (), stages)
+    held = ContactInterval("hand", "block", 0.5, 3.0, 1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    return ContactEventSequence("demo", 0.02, 150, StagingCfg(), entities, (held,), (), stages)
 
 
 def make_table(m: mujoco.MjModel, empty: int | None = None) -> tuple[PairTable, np.ndarray]:

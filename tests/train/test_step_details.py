@@ -38,7 +38,9 @@ def exact_task(**kinds) -> Task:
     active = np.broadcast_to([True, False, False], shape)
     zero, points = np.zeros(shape), np.zeros((*shape, 3))
     table = PairTable(block, points, zero, box, points, zero, points, active)
-    return replace(task, table=table, robot_slots=active.copy())
+    (held,) = task.events.body_contacts
+    events = replace(task.events, body_contacts=(replace(held, b="box"),))
+    return replace(task, table=table, robot_slots=active.copy(), events=events)
 
 
 def at_places(task: Task, places: list[tuple[float, float, float]], cfg=EXACT) -> tuple[Environment, ChosenPhysics]:

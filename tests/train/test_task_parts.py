@@ -245,6 +245,21 @@ def test_objects_are_grasped_in_stages_that_do_not_start_with_the_robot():
     assert none.grasped_objects(2) == (False,) * 3
 
 
+def test_contacts_of_the_robot_that_only_the_target_has_are_no_grasp():
+    task = make_task()
+    table, rested = task.table, 1
+    box = task.compiled.body("box").id
+    body_a, body_b, robot = table.body_a.copy(), table.body_b.copy(), task.robot_slots.copy()
+    body_a[2, rested], body_b[2, rested], robot[2, rested] = task.compiled.body("left").id, box, True
+    touching = replace(task, table=replace(table, body_a=body_a, body_b=body_b), robot_slots=robot)
+    assert touching.grasping_slots(2).tolist() == [False, False, True]
+    assert touching.grasped_objects(2) == (True, False, False)
+    # The box was touched, and no longer is, when the stage begins.
+    (held,) = task.events.body_contacts
+    events = replace(task.events, body_contacts=(held, replace(held, b="box", start=1.0, end=1.9)))
+    assert replace(touching, events=events).grasping_slots(2).tolist() == [False, False, True]
+
+
 def test_objects_are_in_the_order_of_the_time_for_which_links_touch_them():
     model = make_model()
 

@@ -155,8 +155,8 @@ class Environment(VecEnv):
         self._objects = index(list(task.objects))
         tool, stages = int(m.site_bodyid[robot.tool]), range(len(task.robot_slots))
         self._frames = index([[tool if grasped else 0 for grasped in task.grasped_objects(s)] for s in stages])
-        grasped_at_start = np.array([task.starts_grasped(s) for s in stages])
-        self._watched = torch.as_tensor(task.robot_slots & grasped_at_start[:, None], device=self.device)
+        watched = np.stack([task.grasping_slots(s) for s in stages])
+        self._watched = torch.as_tensor(watched, device=self.device)
         self._target = None if task.target_position is None else real(task.target_position)
         self._max_deviation, self._max_grasp_gap, self._max_object_gap = cfg.success, cfg.dropped, cfg.lost
         self._rest = max(1, round(cfg.chain.rest / self.control_step))

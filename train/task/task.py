@@ -151,13 +151,26 @@ class Task:
         return tuple(range(self.first, self.stage + 1))
 
     def starts_grasped(self, stage: int) -> bool:
-        """Return whether a stage starts with object 1 grasped, and keeps it grasped."""
-        return self.events.stages[stage].bodies[0] != "robot" and bool(self.robot_slots[stage].any())
+        """Return whether a stage starts with an object grasped, and keeps it grasped."""
+        return bool(self.grasping_slots(stage).any())
 
     def grasped_objects(self, stage: int) -> tuple[bool, ...]:
         """Return whether each object is grasped from the start of a stage to its target event."""
-        touched = self.table.body_b[stage][self.robot_slots[stage]]
-        return tuple(self.starts_grasped(stage) and body in touched for body in self.objects)
+        touched = self.table.body_b[stage][self.grasping_slots(stage)]
+        return tuple(body in touched for body in self.objects)
+
+    def grasping_slots(self, stage: int) -> np.ndarray:
+        """Return the slots of a stage by whose pairs the robot grasps an object from the start on, shape (slots,) bool.
+
+        A contact of the robot that only the target event has, as of a finger that comes to rest on the box, is none.
+        """
+        of = self.events.stages[stage]
+        if of.bodies[0] == "robot":
+            return np.zeros_like(self.robot_slots[stage])
+        robot = {e.body for e in self.events.entities if e.role == "robot"}
+        held = {c.b for c in self.events.body_contacts if c.a in robot and c.start <= of.start < c.end}
+        bodies = [self.compiled.body(name).id for name in held]
+        return self.robot_slots[stage] & np.isin(self.table.body_b[stage], bodies)
 
 
 def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
