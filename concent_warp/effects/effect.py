@@ -68,6 +68,9 @@ class Parameter:
     """Typical difference from the null value: the standard deviation of the prior, and the unit of a fit's steps."""
     scan: tuple[float, ...] = ()
     """Values to try where the sensitivity at the null value is zero or misleading, as for effects with a threshold."""
+    scan_together: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """Lines of values to try, each from the null value outward, of it and the parameters after it: where a change of
+    one alone misleads."""
     typical: float = 0.0
     """The same in the odds between effects that explain as much, where it is more than `scale`: what experience expects
     may be more than a step over which motion is linear."""

@@ -16,6 +16,7 @@ GROUP = "concent_warp.effects"
 OURS: tuple[type[Effect], ...] = (
     joints.JointFriction,
     joints.JointDamping,
+    joints.JointStiffness,
     joints.Stribeck,
     joints.LoadDependentFriction,
     joints.Armature,

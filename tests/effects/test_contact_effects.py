@@ -115,6 +115,16 @@ def test_ball_rebounds_as_a_mass_on_the_spring_and_damper_of_its_contact(time_co
     assert ball.qpos[rises:, 2].max() - RADIUS == pytest.approx(bounce(time_constant, damping, 1.0), rel=0.02)
 
 
+def test_contact_with_stiffness_and_damping_given_directly_rebounds_as_with_its_time_constant():
+    fine = BALL.replace('timestep="0.001"', 'timestep="0.0002"')
+    direct = fine.replace("<geom ", '<geom solref="-40000 -100" ', 1)
+    values = (2 / 60, 60 / (2 * np.sqrt(20000)))
+    start = {"qpos": [0, 0, 0.1, *UPRIGHT]}
+    one = move(world(direct, ContactCompliance("thing"), *values), 0.5, **start)
+    other = move(world(fine, ContactCompliance("thing"), *values), 0.5, **start)
+    np.testing.assert_allclose(one.qpos, other.qpos, atol=1e-9)
+
+
 def test_ball_at_rest_sinks_into_a_softer_contact_by_its_static_sag():
     xml = BALL.replace("<geom ", '<geom solimp="0.9 0.9 0.001" ')
     ball = move(world(xml, ContactCompliance("thing"), 0.05, 1.0), 2.0)

@@ -249,7 +249,7 @@ def test_wrong_target_value_or_name_gives_one_clear_sentence(name):
 )
 def test_target_that_the_effect_cannot_act_on_is_refused(scene, name, target):
     xml = SCENES[scene][0]
-    xml = xml.replace("<freejoint/>", '<freejoint name="loose"/>').replace('solref="0.015 0.9"', 'solref="-100 -1"')
+    xml = xml.replace("<freejoint/>", '<freejoint name="loose"/>').replace('solref="0.015 0.9"', 'solref="-100 0"')
     xml = xml.replace("</actuator>", '<motor name="torque" joint="elbow"/><motor name="site" site="tip"/></actuator>')
     xml = xml.replace("</worldbody>", '<body name="bare"><site name="tip"/></body></worldbody>')
     with pytest.raises(ModelError) as raised:

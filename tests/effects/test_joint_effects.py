@@ -9,6 +9,7 @@ from concent_warp.effects.library.joints import (
     JointDamping,
     JointFriction,
     JointOffset,
+    JointStiffness,
     LoadDependentFriction,
     Stribeck,
 )
@@ -133,3 +134,29 @@ def test_bearings_of_ball_joints_brake_about_every_axis(effect, value, left):
         moved = move(model, 0.5, qvel=qvel)
         assert moved.qvel[-1, axis] == pytest.approx(left, rel=2e-3)
         assert moved.qvel[-1, 3] == 0.0
+
+
+def test_spring_swings_a_cart_about_where_it_rests():
+    cart = move(world(CART, JointStiffness("rail"), 50.0, 50.0 * 0.04), 1.0, qpos=[0.1])
+    expected = 0.04 + 0.06 * np.cos(np.sqrt(50 / MASS) * cart.time)
+    np.testing.assert_allclose(cart.qpos[:, 0], expected, atol=2e-4)
+
+
+def test_preload_without_stiffness_is_a_constant_force():
+    cart = move(world(CART, JointStiffness("rail"), 0.0, 3.0), 0.5)
+    assert cart.qpos[-1, 0] == pytest.approx(0.5 * 3.0 / MASS * 0.5**2, rel=3e-3)
+
+
+def test_spring_values_are_those_of_the_whole_spring_and_its_null_values_the_models_own():
+    model = world(SLIDER.format(joint='stiffness="50" springref="0.02"', actuator=MOTOR))
+    stiffness, preload = JointStiffness("rail").parameters(model.compile())
+    assert (stiffness.null, preload.null) == (50.0, 1.0)
+    assert stiffness.low == 0
+    stronger = model.add(JointStiffness("rail"), {"stiffness[rail]": 80.0}).compile()
+    assert stronger.jnt_stiffness[0] == 80.0
+    assert stronger.qpos_spring[0] == pytest.approx(1.0 / 80.0)
+
+
+def test_null_values_of_a_spring_leave_the_rest_position_of_a_joint_without_stiffness():
+    model = world(SLIDER.format(joint='springref="0.02"', actuator=MOTOR)).add(JointStiffness("rail"))
+    assert model.compile().qpos_spring[0] == pytest.approx(0.02)

@@ -400,13 +400,39 @@ def test_compliance_is_the_mean_of_the_sides_and_scales_both():
     np.testing.assert_allclose(ContactCompliance("thing").mean(alone), [0.02, 1.0])
 
 
-def test_compliance_needs_contacts_with_a_time_constant():
+def test_compliance_tries_damping_ratios_with_the_stiffness_of_the_model_within_the_bounds():
+    m = compiled(SURFACES.format(condim=3))
+    time, ratio = ContactCompliance("thing").parameters(m)
+    rebound, damped = time.scan_together
+    for line, sign in ((rebound, 1), (damped, -1)):
+        assert (np.diff([row[0] for row in line]) * sign > 0).all()
+        for row in line:
+            assert row[0] * row[1] == pytest.approx(time.null * ratio.null)
+            assert time.low <= row[0] <= time.high
+    assert len(rebound) == 4
+    assert len(damped) == 2  # the third has a time constant of less than two time steps
+
+
+def test_compliance_needs_contacts_that_are_damped():
     m = compiled(SURFACES.format(condim=3))
     assert ContactCompliance.targets(m) == (("thing",), ("other",))
     for stiff in ('solref=".01 .8"', 'solref=".04 .6"'):
-        direct = compiled(SURFACES.format(condim=3).replace(stiff, 'solref="-100 -1"'))
-        assert ContactCompliance.targets(direct) == ((("other",),) if ".04" in stiff else ())
+        undamped = compiled(SURFACES.format(condim=3).replace(stiff, 'solref="-100 0"'))
+        assert ContactCompliance.targets(undamped) == ((("other",),) if ".04" in stiff else ())
     assert not ContactCompliance("thing").applies_to(compiled(SLIDER.format(joint="", actuator=MOTOR)), 1)
+
+
+def test_compliance_of_stiffness_and_damping_that_are_given_directly_stays_so():
+    xml = SURFACES.format(condim=3).replace('solref=".04 .6"', 'solref="-5000 -40"')
+    m, effect = compiled(xml), ContactCompliance("thing")
+    np.testing.assert_allclose(effect.mean(m), [2 / 40, 40 / (2 * np.sqrt(5000))])
+    before = m.geom_solref.copy()
+    effect.write(m, effect.mean(m))
+    np.testing.assert_allclose(m.geom_solref, before)
+    effect.write(m, np.array([2 / 20, 20 / (2 * np.sqrt(8000))]))
+    (direct,) = np.flatnonzero(before[:, 0] < 0)
+    np.testing.assert_allclose(m.geom_solref[direct], [-8000, -20])
+    np.testing.assert_allclose(effect.mean(m), [2 / 20, 20 / (2 * np.sqrt(8000))])
 
 
 def test_adhesion_is_scaled_by_the_weight_and_acts_on_all_that_moves_with_the_body():

@@ -150,7 +150,7 @@ def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Li
 def _scan(
     solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray], cfg: SearchCfg
 ) -> tuple[float, np.ndarray]:
-    """Return the gain of the best scanned value of any parameter, and the parameters (P,) from which to fit.
+    """Return the gain of the best scanned values, and the parameters (P,) from which to fit.
 
     Threshold effects such as adhesion or backlash have no sensitivity at their null value. Values that gain nothing in
     the windows with the largest residuals are simulated in no others, and those beyond one that is far worse there than
@@ -169,11 +169,9 @@ def _scan(
     count = int(np.searchsorted(np.cumsum(before[order]), cfg.first_scanned_share * before.sum())) + 1
     first, rest = order[:count].tolist(), order[count:].tolist()
     first_before, total = float(before[first].sum()), max(float(before.sum()), 1e-12)
-    for k, outward in _outward(solver, values):
+    for outward in _outward(solver, values):
         least = np.inf
-        for value in outward:
-            moved = values.copy()
-            moved[k] = value
+        for moved in outward:
             left = robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
             least = min(least, left)
             if left > max(cfg.max_scanned_rise * least, first_before):
@@ -187,10 +185,18 @@ def _scan(
     return best, start
 
 
-def _outward(solver: Solver, values: np.ndarray) -> Iterator[tuple[int, list[float]]]:
-    """Yield the scanned values of each parameter of a candidate, on each side from the nearest to its null value on."""
+def _outward(solver: Solver, values: np.ndarray) -> Iterator[list[np.ndarray]]:
+    """Yield lines of scanned parameters of a candidate, (P,) each: from the null value to each side, and together."""
+
+    def moved(k: int, row: Sequence[float]) -> np.ndarray:
+        found = values.copy()
+        found[k : k + len(row)] = row
+        return found
+
     for k, parameter in enumerate(solver.p.parameters):
         if k < solver.p.owned:
             continue
-        yield k, sorted((v for v in parameter.scan if v < values[k]), reverse=True)
-        yield k, sorted(v for v in parameter.scan if v > values[k])
+        yield [moved(k, [v]) for v in sorted((v for v in parameter.scan if v < values[k]), reverse=True)]
+        yield [moved(k, [v]) for v in sorted(v for v in parameter.scan if v > values[k])]
+        for line in parameter.scan_together:
+            yield [moved(k, row) for row in line]

@@ -197,6 +197,13 @@ class AnisotropicFriction(SurfaceEffect):
         return AnisotropicForce(m, self.ids(m))
 
 
+REBOUND_FACTORS = (0.6, 0.35, 0.2, 0.1)
+"""Damping ratios over the model's that are tried with its stiffness: from a ball of clay to one that bounces well, the
+share of the velocity that is left, exp(-pi r / sqrt(1 - r^2)), is never far from that of one of them [-]."""
+DAMPED_FACTORS = (1.7, 3.0, 6.0)
+"""The same above the model's."""
+
+
 class ContactCompliance(SurfaceEffect):
     """Contacts softer, harder or bouncier than the model's."""
 
@@ -206,31 +213,36 @@ class ContactCompliance(SurfaceEffect):
     signature = "height of rebounds; sinking in at rest and at impacts"
     confusions = ("size", "adhesion", "air_drag")
     null_error = 0.025  # rebounds of one ball from one floor scatter by 2 to 3 %
-    requirement = "bodies that collide, where their contacts and those of all that stands still have a time constant"
+    requirement = "bodies that collide, in contacts that are damped"
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether the contacts have a time constant."""
-        return super().applies_to(m, i) and bool((m.geom_solref[surfaces(m, i), 0] > 0).all())
+        """Return whether its contacts are damped."""
+        return super().applies_to(m, i) and bool(np.isfinite(_mean_solref(m, np.array([i]))).all())
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body whose contacts have a time constant."""
+        """Return each free body whose contacts are damped."""
         return tuple(t for t in free_body_targets(m) if cls(*t).applies_to(m, m.body(t[0]).id))
 
     def mean(self, m: mujoco.MjModel) -> np.ndarray:
         """Return time constant [s] and damping ratio of body and surroundings, as they act together, shape (2,)."""
-        body = np.concatenate([geoms_of(m, b) for b in self.ids(m)])
-        geoms = self.geoms(m)
-        sides = [np.intersect1d(geoms, body), np.setdiff1d(geoms, body)]
-        return np.mean([m.geom_solref[ids].mean(axis=0) for ids in sides if len(ids)], axis=0)
+        return _mean_solref(m, self.ids(m))
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Time constant and damping ratio; the null values are the means of body and surroundings."""
-        time, ratio = self.mean(m)
-        least = min(2 * m.opt.timestep, time)
+        time, ratio = map(float, self.mean(m))
+        least, most = min(2 * m.opt.timestep, time), max(0.2, 5 * time)
+        low, high = min(0.02, 0.2 * ratio), max(5.0, 5 * ratio)
+        # The damping ratio alone changes the stiffness, too, by its square: the model's time step does not resolve one
+        # that bounces and has the time constant of one that does not. Along these lines the stiffness is the model's.
+        lines = tuple(
+            tuple((x, y) for f in line if least <= (x := time / f) <= most and low <= (y := ratio * f) <= high)
+            for line in (REBOUND_FACTORS, DAMPED_FACTORS)
+        )
+        scan = (0.1 * ratio, 0.3 * ratio, 0.6 * ratio)
         return (
-            Parameter("time_constant", "s", float(time), float(least), 0.2, 0.5 * float(time)),
-            Parameter("damping_ratio", "-", float(ratio), 0.02, 5.0, 0.4, scan=(0.1 * ratio, 0.3 * ratio, 0.6 * ratio)),
+            Parameter("time_constant", "s", time, float(least), most, 0.5 * time, scan_together=lines),
+            Parameter("damping_ratio", "-", ratio, low, high, 0.4, scan=scan),
         )
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -239,7 +251,30 @@ class ContactCompliance(SurfaceEffect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the mean, and all others in proportion."""
-        m.geom_solref[self.geoms(m)] *= values / self.mean(m)
+        geoms, factor = self.geoms(m), values / self.mean(m)
+        direct = geoms[m.geom_solref[geoms, 0] <= 0]
+        m.geom_solref[np.setdiff1d(geoms, direct)] *= factor
+        m.geom_solref[direct] *= [1 / np.prod(factor) ** 2, 1 / factor[0]]
+
+
+def _mean_solref(m: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    """Return time constant [s] and damping ratio of contacts of bodies (n,) with all that stands still, shape (2,).
+
+    MuJoCo takes the mean of two geoms; stiffness and damping that are given directly, by negative numbers, come before
+    a time constant, and the larger ones of two geoms act. An undamped contact has an infinite time constant.
+    """
+    mine = np.concatenate([geoms_of(m, b) for b in bodies])
+    geoms = np.unique(np.concatenate([surfaces(m, b) for b in bodies]))
+    direct = m.geom_solref[geoms, 0] <= 0
+    acting = geoms[direct] if direct.any() else geoms
+    sides = [np.intersect1d(acting, mine), np.setdiff1d(acting, mine)]
+    means = [m.geom_solref[ids].mean(axis=0) for ids in sides if len(ids)]
+    if not direct.any():
+        return np.mean(means, axis=0)
+    stiffness, damping = -np.min(means, axis=0)
+    if not (stiffness > 0 and damping > 0):
+        return np.array([np.inf, 0.0])
+    return np.array([2 / damping, damping / (2 * np.sqrt(stiffness))])
 
 
 class Adhesion(SurfaceEffect):

@@ -1,4 +1,4 @@
-"""Effects in joints: friction of four kinds, rotor inertia, zero offset."""
+"""Effects in joints: friction of four kinds, springs, rotor inertia, zero offset."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ FRICTION_SCATTER = 0.03
 time and temperature (joints: Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30(7), 1994; Bittencourt and
 Gunnarsson, J. Dyn. Sys. Meas. Control 134(5), 2012; contacts: Yu, Bauza, Fazeli and Rodriguez, IROS 2016)."""
 MUJOCO = "MuJoCo documentation, chapters Computation and Modeling"
+FARTHEST_REST = 1e4
+"""Farthest rest position of a spring [rad or m]: from there its force is the same in all positions, to a single
+precision of the force."""
 
 
 class JointEffect(Effect):
@@ -135,6 +138,62 @@ class JointDamping(BearingEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the damping."""
         self.set_dofs(m.dof_damping, m, values)
+
+
+class JointStiffness(JointEffect):
+    """Springs in joints.
+
+    The force is linear in both parameters. In stiffness and rest position it is not: without stiffness no rest position
+    would show, and a spring that rests far outside the motion, as one that closes a door, would hardly show in its
+    stiffness alone.
+    """
+
+    name = "joint_stiffness"
+    summary = "A spring on the joint: tau = preload - stiffness q, which rests at q = preload / stiffness."
+    source = f"Hooke's law; MuJoCo's joint stiffness and springref ({MUJOCO})"
+    signature = "residual torque that is linear in position, whatever the speed and the command"
+    confusions = ("gravity_compensation", "actuator_gain", "mass", "gravity_tilt", "joint_offset", "center_of_mass")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Return stiffness, then preload of each joint: the force of its spring where the joint reads zero.
+
+        A typical spring swings the joint at half a hertz, and moves it at 10 rad/s^2 where it is preloaded.
+        """
+        ids = self.ids(m)
+        typical, stiffness, preload = typical_torque(m, ids), m.jnt_stiffness[ids], _preload(m, ids)
+        stiffnesses = self.parameter_per_joint(
+            "stiffness",
+            self.units(m, "N m/rad", "N/m"),
+            stiffness,
+            0.3 * typical,
+            np.maximum(200 * typical, 5 * stiffness),
+            1 / 0.3,
+        )
+        unit, farthest = self.units(m, "N m", "N"), np.maximum(200 * typical, 5 * np.abs(preload))
+        preloads = (
+            Parameter(f"preload[{n}]", unit, float(p), -float(far), float(far), 0.3 * float(t), typical=float(t))
+            for n, p, far, t in zip(self.target, preload, farthest, typical, strict=True)
+        )
+        return (*stiffnesses, *preloads)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Stiffness and rest position."""
+        return ("jnt_stiffness", "qpos_spring")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set both; a preload without stiffness is that of a weak spring that rests far away."""
+        ids = self.ids(m)
+        stiffness, preload = np.split(np.asarray(values, dtype=float), 2)
+        stiffness = np.maximum(np.maximum(stiffness, 0.0), np.abs(preload) / FARTHEST_REST)
+        changed = (stiffness != m.jnt_stiffness[ids]) | (preload != _preload(m, ids))
+        rest = np.divide(preload, stiffness, out=np.zeros_like(preload), where=stiffness > 0)
+        m.qpos_spring[m.jnt_qposadr[ids[changed]]] = rest[changed]
+        m.jnt_stiffness[ids] = stiffness
+
+
+def _preload(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
+    """Return the force of the spring of each hinge or slide where the joint reads zero [N m or N], shape (n,)."""
+    return m.jnt_stiffness[joints] * m.qpos_spring[m.jnt_qposadr[joints]]
 
 
 class Armature(JointEffect):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,7 +114,8 @@ def fit_effects(
 ) -> FittedEffects:
     """Fit all parameters of a model's effects together with the initial states.
 
-    Parameters at their null value that have values to scan (`Parameter.scan`) start from the best of these.
+    Parameters at their null value that have values to scan (`Parameter.scan`, `scan_together`) start from the best of
+    these.
 
     Args:
         model: The model with effects, at the values to start from.
@@ -223,6 +225,10 @@ def _best_start(
             for value in parameter.scan:
                 moved = trials[0].copy()
                 moved[k] = value
+                trials.append(moved)
+            for row in itertools.chain.from_iterable(parameter.scan_together):
+                moved = trials[0].copy()
+                moved[k : k + len(row)] = row
                 trials.append(moved)
     if len(trials) == 1:
         return trials[0]

@@ -1,4 +1,4 @@
-"""Hidden effects in joints: friction by a bristle model, damping, rotor inertia, wrong support against gravity.
+"""Hidden effects in joints: friction by a bristle model, damping, springs, rotor inertia, wrong support of the weight.
 
 Friction follows Canudas de Wit, Olsson, Astrom, Lischinsky, "A new model for control of systems with friction", IEEE
 Trans. Automatic Control 40(3), 1995 (LuGre): dz/dt = v - sigma |v| z / g(v), force sigma z + sigma_1 dz/dt. The
@@ -19,6 +19,8 @@ from concent_warp.reality.world import HiddenEffect
 
 BRISTLE_DEFLECTION = {"hinge": 1e-4, "slide": 1e-5}
 """How far bristles give before they slip [rad], [m]."""
+SPRING_REST = {"hinge": -0.3, "slide": -0.03}
+"""Where hidden springs rest [rad], [m]."""
 Level = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
 """Given model, data and degree of freedom, returns the friction at steady sliding [N m or N]."""
 
@@ -116,6 +118,23 @@ def joint_damping(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     return HiddenEffectOfRig("joint_damping", HiddenEffect("joint_damping", force=force), truth, joints)
 
 
+def joint_stiffness(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
+    """Return springs of a stiffness [N m/rad or N/m] on the strongest drive, of less on weaker ones."""
+    found = drives(rig)
+    stiffness = np.array([magnitude * d.weight for d in found])
+    joints = tuple(d.joint for d in found)
+    slides = [rig.scene.model.joint(j).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for j in joints]
+    rest = np.array([SPRING_REST["slide" if slide else "hinge"] for slide in slides])
+
+    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        for name, spring, zero in zip(joints, stiffness, rest, strict=True):
+            joint = model.joint(name)
+            data.qfrc_applied[joint.dofadr[0]] -= spring * (data.qpos[joint.qposadr[0]] - zero)
+
+    truth = {**true_values("stiffness", joints, stiffness), **true_values("preload", joints, stiffness * rest)}
+    return HiddenEffectOfRig("joint_stiffness", HiddenEffect("joint_stiffness", force=force), truth, joints)
+
+
 def armature(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Return rotor inertia beyond the nominal one [kg m^2 or kg] of the strongest drive."""
     found = drives(rig)
@@ -155,6 +174,7 @@ JOINTS: dict[str, Builder] = {
         stribeck_friction,
         load_friction,
         joint_damping,
+        joint_stiffness,
         armature,
         gravity_compensation,
     )

@@ -21,6 +21,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "stribeck_friction": (0.02, 0.043, 0.1),
         "load_friction": (0.04, 0.09, 0.22),
         "joint_damping": (0.0025, 0.0055, 0.014),
+        "joint_stiffness": (0.009, 0.018, 0.045),
         "armature": (1e-4, 2e-4, 5e-4),
         "actuator_gain": (0.98, 0.95, 0.88),
         "actuator_saturation": (1.16, 1.1, 1.0),
@@ -42,6 +43,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
     "arm": {
         "joint_friction": (0.6, 1.2, 3.0),
         "joint_damping": (0.9, 1.9, 4.5),
+        "joint_stiffness": (0.6, 1.2, 3.0),
         "armature": (0.18, 0.38, 0.9),
         "gravity_compensation": (0.04, 0.089, 0.22),
         "actuator_gain": (0.91, 0.81, 0.6),
@@ -72,6 +74,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "mass": (1.2, 1.47, 2.2),
         "joint_friction": (0.3, 0.66, 1.6),
         "joint_damping": (2.0, 4.5, 11.0),
+        "joint_stiffness": (0.9, 1.8, 4.5),
         "armature": (0.4, 0.9, 2.2),
         "actuator_gain": (0.85, 0.7, 0.45),
         "actuator_delay": (0.0012, 0.0026, 0.0065),

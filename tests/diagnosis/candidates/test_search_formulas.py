@@ -133,6 +133,21 @@ def scanning(monkeypatch, parameters, share):
 OWN = Parameter("own", "-", 0.0, 0.0, 9.0, 1.0, scan=(5.0,))
 
 
+def test_lines_of_values_are_tried_together_each_until_it_gets_far_worse(monkeypatch):
+    lines = (((1.0, 2.0), (2.0, 4.0), (3.0, 6.0)), ((4.0, 1.0),))
+    parameters = [
+        OWN,
+        Parameter("a", "-", 0.0, 0.0, 9.0, 1.0, scan_together=lines),
+        Parameter("b", "-", 0.0, 0.0, 9.0, 1.0, scan=(5.0,)),
+    ]
+    left = {1.0: 0.7, 2.0: 1.8, 4.0: 0.9}
+    gain, start, tried, _ = scanning(monkeypatch, parameters, lambda values: left.get(values[1], 0.95))
+    in_turn = [values[1:] for k, (values, _) in enumerate(tried) if not k or values != tried[k - 1][0]]
+    assert in_turn == [[1.0, 2.0], [2.0, 4.0], [4.0, 1.0], [0.0, 5.0]]
+    assert gain == pytest.approx(0.3)
+    assert start == [0.5, 1.0, 2.0]
+
+
 def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monkeypatch):
     parameters = [
         OWN,
