@@ -70,3 +70,35 @@ def test_what_was_refused_is_looked_for_beside_errors_of_impacts(monkeypatch, p,
     assert fitted == ([nodes["rough"], nodes["added"]] if answer == "rough" else [nodes["given"]])
     assert [f.name for f in made.record.accepted()] == ([found] if answer == "rough" else [])
     assert made.impacts_left is (answer == "rough")
+
+
+@pytest.mark.parametrize(
+    ("gain", "first", "then", "answer"),
+    [
+        (0.1, True, ("time_base",), "rough"),  # a small one: those errors decide between it and others
+        (0.1, True, (), "given"),
+        (0.1, True, ("time_base", "wind"), "given"),
+        (0.1, False, (), "rough"),  # it does not stand
+        (0.2, True, ("time_base",), "given"),
+    ],
+)
+def test_beside_a_small_effect_that_stands_a_single_one_beside_errors_of_impacts_is_the_answer(
+    monkeypatch, gain, first, then, answer
+):
+    made, given, rough = procedure(), node(1.05), node(1.0)
+    after = [node(0.98, effects=k + 1) for k in range(2)]
+    monkeypatch.setattr(made, "baseline_with_errors_of_impacts", lambda *_: rough)
+    monkeypatch.setattr(made, "_stand", lambda *_: first)
+
+    def search(base):
+        found = ("length_scale",) if base is given else then
+        kept = gain if base is given else 0.1
+        made.record.findings += [
+            replace(finding(name, kept, step=k), family="measurement") for k, name in enumerate(found)
+        ]
+        return [base, *after[: len(found)]], ()
+
+    monkeypatch.setattr(made, "search", search)
+    base, _, _ = made.search_beside_impacts(given)
+    assert base is {"rough": rough, "given": given}[answer]
+    assert [f.name for f in made.record.accepted()] == list(then if answer == "rough" else ("length_scale",))
