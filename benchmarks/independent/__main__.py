@@ -6,6 +6,7 @@ python -m benchmarks.independent --locked --out runs/locked       # the locked s
 python -m benchmarks.independent --recordings FOLDER              # of recordings that were made elsewhere
 python -m benchmarks.independent --report                         # the page from what is done
 python -m benchmarks.independent --report --earlier OTHER/results.jsonl --locked-results LOCKED/results.jsonl
+python -m benchmarks.independent.visible NAME                     # by how much the hidden effect of a set shows at all
 
 Each set is diagnosed by `--cores` processes of its own, `--jobs` sets at a time, within `--limit` seconds. Results are
 kept in `--out`, one file a set and `results.jsonl` with all, so that the command may be stopped and called again.

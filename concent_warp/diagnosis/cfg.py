@@ -313,6 +313,13 @@ class DiagnoseCfg:
     quiet_min_gain: Share = 0.125
     """The same where the model leaves little more than noise in size [-]: errors of formulas, too, can be found there,
     in long recordings. Empirical."""
+    small_min_gain: Share = 0.0625
+    """The same of the first effect on the model as given, if it removes `min_gain` also beside all nominal values
+    within their tolerance [-]: a half of that, as errors of nominal values are not behind it. Where errors of impacts
+    count as noise, `min_gain` alone."""
+    min_impact_evidence: Positive = 10.0
+    """Log likelihood that an effect must gain there beside errors of impacts [-], or `quiet_min_gain`: odds of 20 000,
+    which leave 100 to 1 after a choice among 50 effects and Schwarz's price of two parameters."""
     min_remainder_gain: Share = 0.5
     """Share of what a model leaves beyond the noise that an effect must remove where the model leaves little,
     `adequate_ratio` [-]: one that is missing explains most of it, one that takes up an error in a formula a part.

@@ -122,30 +122,35 @@ class Procedure:
     ) -> tuple[FittedModel, list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given, the same and after each addition, and the detectable sizes of all effects.
 
-        Where these do not explain the data, or errors of impacts may stand behind them, the search is repeated with
-        such errors among the noise. What it finds counts where it explains the data; if the first answer explained
-        them, too, where it does so down to the noise by fewer effects. The model as given is then fitted to windows
-        with such errors.
+        Where these do not explain the data, or errors of impacts may stand behind them or hide them, the search is
+        repeated with such errors among the noise. What it finds counts where it explains the data; if the first answer
+        explained them, too, where it does so down to the noise by fewer effects. Beside a small effect that stands, and
+        where none was found, a single one counts. The model as given is then fitted to windows with such errors.
         """
         context, begun = self.context, self.context.record.copy()
         fitted, detectable = self.search(given)
         added = bool(self.record.accepted())
         explained = context.explains(fitted[-1], given, added=added)
-        if (explained and not added) or context.budget.cut:
+        if (explained and not added and not self._may_be_hidden()) or context.budget.cut:
             return given, fitted, detectable
         left_open = "Open: what is missing where errors of impacts are allowed for."
         rough = context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given, fitted), None, left_open)
         if rough is None:
             return given, fitted, detectable
-        if explained and context.budget.attempt(lambda: self._stand(fitted, rough), True, left_open):
-            return given, fitted, detectable
+        stands = not added
+        if added and explained:
+            stands = context.budget.attempt(lambda: self._stand(given, fitted, rough), True, left_open)
+            if stands and not self._is_small(given):
+                return given, fitted, detectable
         budget, settled = context.budget, context.record
         cut, unsettled = budget.cut, budget.unsettled
-        context.record, budget.cut, budget.unsettled = begun, set(), []
+        context.record, budget.cut, budget.unsettled = replace(begun, beside_impacts=True), set(), []
         beside, smallest = self.search(rough)
         count = len(self.record.accepted())
         enough = context.explains(beside[-1], rough, added=count > 0)
-        if explained:
+        if explained and stands:
+            enough &= count == 1
+        elif explained:
             ratio = least_ratio(beside[-1], context.noise_factors)
             enough &= count < len(settled.accepted()) and ratio <= context.cfg.search.explained_ratio
         if enough and not budget.cut:
@@ -154,21 +159,37 @@ class Procedure:
         context.record, budget.cut, budget.unsettled = settled, cut, unsettled
         return given, fitted, detectable
 
-    def _stand(self, fitted: Sequence[FittedModel], rough: FittedModel) -> bool:
+    def _may_be_hidden(self) -> bool:
+        """Return whether an effect that was refused would not be by its gain alone: what impacts leave may hide it."""
+        cfg = self.context.cfg
+        return any(f.p <= cfg.quiet_significance_level and f.gain >= cfg.min_gain for f in self.record.findings)
+
+    def _is_small(self, given: FittedModel) -> bool:
+        """Return whether a single effect was added that removes little of the little that the model as given leaves.
+
+        One of contacts themselves does not count: errors of impacts are about these.
+        """
+        context, accepted = self.context, self.record.accepted()
+        quiet = least_ratio(given, context.noise_factors) <= context.cfg.search.explained_ratio
+        little = len(accepted) == 1 and accepted[0].gain < context.cfg.quiet_min_gain
+        return quiet and little and accepted[0].family != "contact"
+
+    def _stand(self, given: FittedModel, fitted: Sequence[FittedModel], rough: FittedModel) -> bool:
         """Return whether the effects that were added stand beside errors of impacts.
 
         A single one that leaves no more than noise stands, unless it is one of objects, which act through their
-        contacts as laws of these do. Several do not where one is of objects, or where they leave more than noise: each
-        was chosen beside the others, and then all may be wrong.
+        contacts as laws of these do, or is small. Several do not where one is of objects, or where they leave more than
+        noise: each was chosen beside the others, and then all may be wrong.
 
         Args:
-            fitted: The model as given and after each addition.
+            given: The model as given.
+            fitted: The same and after each addition.
             rough: The model as given where errors of impacts count as noise.
         """
         context, accepted = self.context, self.record.accepted()
         near_noise = least_ratio(fitted[-1], context.noise_factors) <= context.cfg.search.explained_ratio
         plain = near_noise and all(f.family != "objects" for f in accepted)
-        if len(accepted) == 1 and plain:
+        if len(accepted) == 1 and plain and not self._is_small(given):
             return True
         if len(accepted) > 1 and not plain:
             return False

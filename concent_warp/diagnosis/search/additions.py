@@ -205,16 +205,21 @@ class Additions:
     def _with_nominal(
         self, fitted: list[FittedModel], finer: FittedModel | None, first: FittedModel
     ) -> list[FittedModel] | None:
-        """Return the fitted models, the last with nominal values and, where that explains as much, a shorter time step.
+        """Return the fitted models, the last with nominal values and, where that explains more, a shorter time step.
 
         It is None where nominal values explain nothing more. Beside an effect they may be at their bounds where they
         leave no more than an error in its formula, which they take up before another effect does.
         """
         enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
-        if finer is not None and (both := self.context.nominal(finer, enough)) is not None:
-            return [*self._adopt(fitted, finer)[:-1], both]
+        both = None if finer is None else self.context.nominal(finer, enough)
         plain = self.context.nominal(fitted[-1], enough)
+        if finer is not None and both is not None and (plain is None or self._needs_step(plain, both)):
+            return [*self._adopt(fitted, finer)[:-1], both]
         return None if plain is None else [*fitted[:-1], plain]
+
+    def _needs_step(self, plain: FittedModel, finer: FittedModel) -> bool:
+        """Return whether a model explains more with a shorter time step, which nominal values may stand in for."""
+        return bool(finer.errors.sum() < (1 - self.context.cfg.min_gain) * plain.errors.sum())
 
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
         """Return the fitted models with the last one replaced by that with a shorter time step."""

@@ -15,7 +15,7 @@ import numpy as np
 from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_from_rivals
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.candidates.candidates import candidates, label
-from concent_warp.diagnosis.candidates.evidence import assess, detectable_size, profile_widening
+from concent_warp.diagnosis.candidates.evidence import assess, detectable_size, leaves_more, profile_widening
 from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
 from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
@@ -25,7 +25,13 @@ from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
 from concent_warp.diagnosis.search.joint_fit import established_effects, joint_parameters
-from concent_warp.diagnosis.search.nominal_values import nominal_errors, nominal_sensitivities
+from concent_warp.diagnosis.search.nominal_values import (
+    NominalSensitivities,
+    errors_beside_nominal_values,
+    nominal_effects,
+    nominal_errors,
+    nominal_sensitivities,
+)
 from concent_warp.diagnosis.search.reconsider import near_best
 from concent_warp.diagnosis.time_budget import in_words
 from concent_warp.effects.effect import Effect
@@ -77,9 +83,13 @@ class AdditionFinder:
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
-        if least_ratio(base, context.noise_factors) <= cfg.search.explained_ratio:
+        quiet = least_ratio(base, context.noise_factors) <= cfg.search.explained_ratio
+        if quiet:
             # What shows in the size of the residual no more than noise does must show the clearer in its structure.
-            cfg = replace(cfg, significance_level=cfg.quiet_significance_level, min_gain=cfg.quiet_min_gain)
+            small = explained and step == 0 and self._is_as_given(base)
+            least_small = cfg.min_gain if context.record.beside_impacts else cfg.small_min_gain
+            least_gain = least_small if small else cfg.quiet_min_gain
+            cfg = replace(cfg, significance_level=cfg.quiet_significance_level, min_gain=least_gain)
         level = cfg.significance_level
         null, critical = self._chance(base, screened, level)
         needed = max(critical, cfg.min_gain)
@@ -111,7 +121,7 @@ class AdditionFinder:
             base = context.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
             findings = [finding(c) for c in fitted]
         if explained:
-            findings = self._established(base, fitted, findings)
+            findings = self._established(base, fitted, findings, quiet=quiet)
         whole = [f for f in findings if f.accepted and f.gain >= self._least_share(base)]
         context.record.part_refused = not whole and any(f.accepted for f in findings)
         if context.record.part_refused:
@@ -181,11 +191,12 @@ class AdditionFinder:
             return []
 
     def _established(
-        self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding]
+        self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding], *, quiet: bool
     ) -> list[Finding]:
         """Return findings, accepted ones with the intervals of the answer, refused if these include the null values.
 
-        Sensitivities to nominal values are those of the model that the candidates are added to.
+        Refused, too, where the model leaves little more than noise in size, are those that remove little and do not so
+        beside all nominal values. Sensitivities to these are those of the model that the candidates are added to.
         """
         found = list(findings)
         if not any(f.accepted for f in findings):
@@ -203,7 +214,30 @@ class AdditionFinder:
             share = self.context.cfg.search.dependent_share
             if not established_effects(added, parameters, share, widening, nominal)[-1]:
                 found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
+            elif quiet and f.gain < self.context.cfg.quiet_min_gain and not self._is_beside_nominal(base, c, shared):
+                reason = "removes little, and less beside nominal values within their tolerance"
+                found[k] = replace(found[k], accepted=False, reason=reason)
         return found
+
+    def _is_as_given(self, base: FittedModel) -> bool:
+        """Return whether nominal values and time step of a fitted model are as given, while they might be others.
+
+        What other ones leave has the structure of their errors.
+        """
+        return self.context.cfg.nominal.enabled and base.windows[0].defect is None and not nominal_effects(base.model)
+
+    def _is_beside_nominal(self, base: FittedModel, c: FittedCandidate, shared: NominalSensitivities | None) -> bool:
+        """Return whether a candidate removes enough beside all nominal values within their tolerance.
+
+        Args:
+            base: The fitted model.
+            c: The candidate.
+            shared: Sensitivities of the model to its nominal values, None where there was no time for them.
+        """
+        if shared is None:
+            return False
+        cfg, (before, after) = self.context.cfg, errors_beside_nominal_values(base, c, shared)
+        return bool(after.sum() <= (1 - cfg.min_gain) * before.sum() and leaves_more(before, after, cfg.search))
 
     def _screened(
         self, base: FittedModel, effects: Sequence[Effect], step: int, part: float = 1.0

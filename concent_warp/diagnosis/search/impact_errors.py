@@ -33,8 +33,12 @@ def stand(
     for k in range(count):
         plain = count == 1 and len(refitted.model.effects) == len(rough.model.effects) + 1
         without = rough if plain else refit_without_effect(refitted, owned + k)
-        quiet = least_ratio(without, noise_factors) <= cfg.search.explained_ratio
-        needed = cfg.quiet_min_gain if quiet else cfg.min_gain
-        gain = 1 - refitted.errors.sum() / max(without.errors.sum(), 1e-12)
-        found.append(bool(gain >= needed and leaves_more(without.errors, refitted.errors, cfg.search)))
+        least = least_ratio(without, noise_factors)
+        fall = float(without.errors.sum() - refitted.errors.sum())
+        gain = fall / max(float(without.errors.sum()), 1e-12)
+        enough = gain >= cfg.min_gain
+        if least <= cfg.search.explained_ratio:
+            evidence = 0.5 * fall * (least / max(without.ratio, 1e-12)) ** 2
+            enough = gain >= cfg.quiet_min_gain or evidence >= cfg.min_impact_evidence
+        found.append(bool(enough and leaves_more(without.errors, refitted.errors, cfg.search)))
     return found

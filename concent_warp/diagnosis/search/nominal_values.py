@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import fitted_model
-from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, nominal_parameters
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import NOMINAL
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
+from concent_warp.fit.effects.least_squares import Linear
 from concent_warp.fit.effects.robust import huber_weight
 from concent_warp.model import Model
 
@@ -101,6 +102,38 @@ def nominal_sensitivities(base: FittedModel) -> NominalSensitivities:
     rows = sum(len(piece.residual) for piece in base.pieces)
     columns = np.concatenate(_sensitivities(base, kinds)) if kinds else np.zeros((rows, 0))
     return NominalSensitivities(names, columns)
+
+
+def errors_beside_nominal_values(
+    base: FittedModel, candidate: FittedCandidate, sensitivities: NominalSensitivities
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return held-out errors of blocks, shape (B,), of a model and with a candidate, both beside nominal values.
+
+    All nominal values within their tolerance, by a linear step, take up what they can of either: less those that the
+    candidate stands for, of what it leaves.
+
+    Args:
+        base: The fitted model.
+        candidate: An effect that was fitted to it.
+        sensitivities: Those of the model to its nominal values.
+    """
+    fitted = {added.effect.name for added in base.model.effects}
+
+    def beside(model: Model, pieces: Sequence[Linear]) -> np.ndarray:
+        kinds = [kind for kind in possible_nominal_effects(model) if kind.name not in fitted]
+        columns = np.nan_to_num(sensitivities.of(kinds), posinf=0.0, neginf=0.0) / base.cfg.least_squares.prior
+        ends = np.cumsum([len(piece.residual) for piece in pieces])[:-1]
+        more = np.split(columns, ends)
+        joined = [
+            replace(piece, jacobian=np.hstack([piece.jacobian, of])) for piece, of in zip(pieces, more, strict=True)
+        ]
+        own = nominal_parameters(base.model)
+        shared = np.pad(own, (0, joined[0].jacobian.shape[1] - len(own)))
+        shared[shared.size - columns.shape[1] :] = True
+        sums = block_sums(joined, base.blocks, base.limit)
+        return HeldOut(sums, base.blocks, base.cfg.least_squares.prior, shared).own()
+
+    return beside(base.model, base.pieces), beside(candidate.model, candidate.pieces)
 
 
 def nominal_errors(

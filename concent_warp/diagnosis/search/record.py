@@ -48,6 +48,8 @@ class SearchRecord:
     """Where dry friction holds by other constants than the model has as given."""
     held_first: int = 0
     """How many of these hold in the model that effects are added to."""
+    beside_impacts: bool = False
+    """Whether errors of impacts count as noise."""
 
     def copy(self) -> SearchRecord:
         """Return a copy that does not change with this one."""

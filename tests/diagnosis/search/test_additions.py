@@ -159,11 +159,14 @@ def test_a_shorter_time_step_that_explains_nearly_all_comes_before_an_effect_tha
 
 def test_nominal_values_are_fitted_with_the_shorter_time_step_where_both_explain_more(monkeypatch):
     given, finer = node(3.0, 100.0), node(2.0, 60.0, timestep=FINER)
-    both, plain = node(1.0, 30.0, timestep=FINER, nominal=2), node(1.01, 30.0, nominal=1)
+    both, plain = node(1.0, 28.0, timestep=FINER, nominal=2), node(1.01, 30.0, nominal=1)
+    close = node(1.0, 29.0, timestep=FINER, nominal=2)
     monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg: finer if one is given else None)
     monkeypatch.setattr(additions, "time_step_finding", lambda base, one, seed: (base, one, seed))
     for answers, left, changed in (
         ({id(finer): both, id(given): plain}, both, True),
+        ({id(finer): both}, both, True),
+        ({id(finer): close, id(given): plain}, plain, False),  # nominal values stand in for the step
         ({id(given): plain}, plain, False),
         ({}, given, False),
     ):

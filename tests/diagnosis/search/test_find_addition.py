@@ -34,7 +34,10 @@ def candidate(name: str, *, is_part: bool = False) -> Any:
     return SimpleNamespace(name=name, is_part=is_part, target=(), elements=())
 
 
-def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0, **given):
+def searched(
+    monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0, step=1, base=None,
+    refitted=0.05, **given
+):  # fmt: skip
     """Return what a search adds whose candidates have these gains, and notes of what is asked for."""
     notes: dict[str, Any] = {"bases": []}
     fitted = [
@@ -53,7 +56,8 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
     def assess(base, c, _null, step, _effects, cfg):
         notes["bases"].append(base)
         notes["level"], notes["min_gain"] = cfg.significance_level, cfg.min_gain
-        return finding(c.name, c.share(base), accepted=gains[c.name][1], step=step)
+        enough = c.share(base) >= cfg.min_gain if "explained" in given else True
+        return finding(c.name, c.share(base), accepted=gains[c.name][1] and enough, step=step)
 
     class Fits:
         left = ()
@@ -70,14 +74,14 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
 
     def refit(base, rivals):
         notes["rivals"] = [c.name for c in rivals]
-        return SimpleNamespace(**{**vars(base), "less": 0.05})
+        return SimpleNamespace(**{**vars(base), "less": refitted})
 
     monkeypatch.setattr(find_addition, "assess", assess)
     monkeypatch.setattr(find_addition, "CandidateFits", Fits)
     monkeypatch.setattr(find_addition, "refit_from_rivals", refit)
     monkeypatch.setattr(find_addition, "profile_widening", lambda _base, c: f"width of {c.name}")
     monkeypatch.setattr(find_addition, "group_indistinguishable", lambda _base, accepted, *_: accepted[:2])
-    return made.additions.finder.find(node(ratio), 1, **given), notes
+    return made.additions.finder.find(base or node(ratio), step, **given), notes
 
 
 def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
@@ -225,6 +229,40 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
         assert first.accepted is not explained
         assert (first.reason == "its parameters may be at their null values") is explained
         assert len(simulated) == explained
+
+
+@pytest.mark.parametrize(
+    ("step", "gain", "beside", "nominal", "added"),
+    [
+        (0, 0.07, (100.0, 94.0), 0, "a"),
+        (-1, 0.06, (100.0, 94.0), 0, "a"),  # as the first, where errors of impacts count as noise
+        (0, 0.07, (100.0, 96.0), 0, None),  # nominal values take up most of it
+        (0, 0.06, (100.0, 90.0), 0, None),
+        (0, 0.13, (100.0, 99.0), 0, "a"),  # clear by itself
+        (1, 0.07, (100.0, 94.0), 0, None),  # beside another effect
+        (0, 0.07, (100.0, 94.0), 1, None),  # beside what nominal values leave
+    ],
+)
+def test_a_small_effect_on_the_model_as_given_counts_where_nominal_values_do_not_take_it_up(
+    monkeypatch, step, gain, beside, nominal, added
+):
+    monkeypatch.setattr(find_addition, "add_candidate", lambda _base, c: c)
+    monkeypatch.setattr(find_addition, "nominal_errors", lambda *_: None)
+    monkeypatch.setattr(find_addition, "nominal_sensitivities", lambda _base: "shared")
+    monkeypatch.setattr(find_addition, "joint_parameters", lambda *_: [(CLEAR,)])
+    monkeypatch.setattr(find_addition, "established_effects", lambda *_: [True])
+    before, after = (np.full(4, error / 4) for error in beside)
+    monkeypatch.setattr(find_addition, "errors_beside_nominal_values", lambda *_: (before, after))
+    made = procedure()
+    made.record.beside_impacts, step = step < 0, max(step, 0)
+    (best, _), asked = searched(
+        monkeypatch, made, {"a": (gain, True)}, np.zeros(10), 1.0, step=step, base=node(1.0, nominal=nominal),
+        refitted=0.0, explained=True,
+    )  # fmt: skip
+    assert (None if best is None else best.name) == added
+    small = step == 0 and not nominal
+    least = 0.05 if made.record.beside_impacts else 0.0625
+    assert asked["min_gain"] == (least if small else 0.125)
 
 
 class Parts:

@@ -16,7 +16,7 @@ def test_a_copy_of_a_record_has_all_of_it_and_does_not_change_with_it():
     rivals, time_step, values, models, unprofiled, holding = made_up
     record = SearchRecord(
         [finding("a", 0.5)], [("a",)], [{"a": MODEL}], {0: np.ones(1)}, unprofiled, {0: rivals},
-        {0: {"b": MODEL}}, time_step, values, 1, True, models, True, holding, 1,
+        {0: {"b": MODEL}}, time_step, values, 1, True, models, True, holding, 1, True,
     )  # fmt: skip
     assert all(getattr(record, f.name) for f in fields(SearchRecord))
     copied = record.copy()
