@@ -30,12 +30,12 @@ CORRELATED = 4
 """Distance from which on depth noise is independent [px]."""
 PROFILE = (-1.0, -0.6, -0.3, 0.3, 0.6, 1.0)
 """Places along the line of search, over its half length, where what is rendered is looked up [-]."""
-MIN_OWN_POSE = 24
-"""Edges from which on a pose is fitted to them alone: four for each of its unknowns."""
-OWN_POSE_ROUNDS = 3
+MIN_OWN_PLACE = 24
+"""Edges from which on a place is fitted to them alone: eight for each of its unknowns."""
+OWN_PLACE_ROUNDS = 3
 """Rounds of reweighting of that fit."""
-NEAR = np.diag([1 / 0.015**2] * 3 + [1 / 0.25**2] * 3)
-"""Information on its distance from the given pose [1/m^2, 1/rad^2]: 15 mm and 0.25 rad."""
+NEAR = 0.015
+"""Standard deviation of its distance from the given one [m]."""
 INSIDE = 0.7
 """Distance inside a contour at which is looked up what covers it [px]."""
 EDGE_SIDES = 8
@@ -361,17 +361,19 @@ def _matched_edges(
 
 
 def _unexplained(jacobian: np.ndarray, residual: np.ndarray, cfg: AlignCfg) -> np.ndarray:
-    """Return what the pose that the edges alone ask for leaves of their residuals (n,), with derivatives (n, 6).
+    """Return what the place that the edges alone ask for leaves of their residuals (n,), with derivatives (n, 6).
 
-    That a pose is off shifts all edges of a side alike. Were this taken for scatter and correlation of edges, their
-    weight would be the smaller the farther off the pose is, and depth would hold it there.
+    That a body is off shifts all edges of a side alike. Were this taken for scatter and correlation of edges, their
+    weight would be the smaller the farther off it is, and depth would hold it there. Turns are not fitted: wrong edges
+    would be explained by them.
     """
     left = residual
-    if len(residual) < MIN_OWN_POSE:
+    if len(residual) < MIN_OWN_PLACE:
         return left
-    for _ in range(OWN_POSE_ROUNDS):
+    for _ in range(OWN_PLACE_ROUNDS):
         normal, _, _ = weighted(jacobian, residual, cfg.min_edge_std, cfg, 1.0, left)
-        left = residual - jacobian @ np.linalg.solve(normal.information + NEAR, normal.gradient)
+        information = normal.information[:3, :3] + np.eye(3) / NEAR**2
+        left = residual - jacobian[:, :3] @ np.linalg.solve(information, normal.gradient[:3])
     return left
 
 
