@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 import concent_warp as cw
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.perception.tracking.cfg import SmoothCfg
+from concent_warp.perception.tracking.alignment.rows import _unexplained
+from concent_warp.perception.tracking.cfg import AlignCfg, SmoothCfg
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.smooth import PoseMeasurement, smooth
 from concent_warp.recording.recording import Demonstration, ImageStream, Recording
@@ -79,6 +80,25 @@ def test_the_orientation_of_a_plain_ball_is_not_written():
     assert len(measured) == 1
     (position,) = measured.values()
     np.testing.assert_allclose(position.value, [pose[:3, 3] for pose in rolling(4, np.radians(9))], atol=1e-3)
+
+
+def test_the_contour_of_a_ball_is_seen_and_says_where_it_is():
+    poses = rolling(5, np.radians(9))
+    (found,) = cw.track(filmed(poses, pattern=False), pose="none").tracks
+    assert found.quality is not None
+    assert np.isfinite(found.quality.edge_residual).all()
+    across = (found.pose[:, :3, 3] - [pose[:3, 3] for pose in poses]) @ camera().pose[:3, :2]
+    assert np.abs(across).max() < 3e-4  # a fifth of a pixel
+
+
+def test_what_a_pose_that_is_off_shifts_all_edges_by_is_no_scatter_of_theirs():
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    jacobian = np.zeros((60, 6))
+    jacobian[:, 0], jacobian[:, 1] = 600 * np.cos(angle), 600 * np.sin(angle)  # [px/m]
+    noise = rng.normal(0, 0.1, 60)
+    left = _unexplained(jacobian, jacobian @ np.array([2e-3, -1e-3, 0, 0, 0, 0]) + noise, AlignCfg())
+    assert np.std(left) < 1.2 * np.std(noise)
 
 
 @pytest.mark.parametrize(("depth", "followed"), [(0.015, True), (0.04, False)])

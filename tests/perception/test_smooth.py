@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 
-from concent_warp.perception.tracking.cfg import SmoothCfg
+from concent_warp.perception.tracking.alignment.align import Fit
+from concent_warp.perception.tracking.alignment.rows import Normal
+from concent_warp.perception.tracking.cfg import SmoothCfg, TrackCfg
+from concent_warp.perception.tracking.demonstration_tracker import _smoothed
 from concent_warp.perception.tracking.geometry.pose import moved, twist_between
 from concent_warp.perception.tracking.smooth import PoseMeasurement, smooth
 
@@ -60,3 +66,38 @@ def test_a_direction_that_no_frame_shows_stays_open():
     _, covariance = smooth(TIME, measurements, 0.03, SmoothCfg())
     assert np.sqrt(covariance[:, 5, 5]).min() > 1.0
     assert np.sqrt(covariance[:, 4, 4]).max() < 0.02
+
+
+def bounced() -> tuple[np.ndarray, list[PoseMeasurement | None]]:
+    """Return heights [m] of a body that bounces between two frames, (T,), and measurements but for three around it."""
+    height = np.abs(6.0 * (TIME - 1.05))
+    truth = np.array([moved(np.eye(4), np.array([0, 0, z, 0, 0, 0])) for z in height])
+    measurements = measured(truth, np.random.default_rng(3))
+    measurements[30:33] = [None] * 3
+    return height, measurements
+
+
+def test_an_impact_in_a_gap_may_be_anywhere_in_it():
+    height, measurements = bounced()
+    poses, covariance = smooth(TIME, measurements, 0.03, SmoothCfg())
+    error = np.abs(poses[:, 2, 3] - height)
+    assert (error < 3 * np.sqrt(covariance[:, 2, 2])).all()
+    assert np.sqrt(covariance[[30, 31, 32], 2, 2]).min() > 0.01
+    assert error[[29, 33]].max() < 4 * STD[2]
+
+
+def test_a_pose_in_a_gap_with_an_impact_is_not_reported():
+    _, measurements = bounced()
+    fits = [
+        None if m is None else Fit(m.pose, Normal(m.information, m.gradient), [], 1e-3, 1.0, np.nan, 0.3, np.nan)
+        for m in measurements
+    ]
+    shape = SimpleNamespace(name="ball", radius=0.03)
+    tracker: Any = SimpleNamespace(fits=fits, shape=shape, symmetry=SimpleNamespace(name="none"), reason="")
+    tracker.numbered_fits, tracker.keyframe_turns = lambda: (fits, 0), list
+    tracker.reasons = ["" if fit else "hidden" for fit in fits]
+    video: Any = SimpleNamespace(time=TIME, cameras=("camera",))
+    found = _smoothed(tracker, video, TrackCfg(), "demo_0")
+    assert np.flatnonzero(found.lost).tolist() == [30, 31, 32]
+    assert found.quality is not None
+    assert found.quality.state[31] == "lost"

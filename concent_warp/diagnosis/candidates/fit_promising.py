@@ -194,12 +194,28 @@ class CandidateFits:
                 continue
             least = min(c.ratio for c in self.fits)
             if least < search.explained_ratio or self._left() < search.decided_share:
-                best = max(c.share(base) for c in self.fits)
+                best = self._promised_by_best(fitted)
                 at_noise = least < search.noise_level_ratio
                 needed = search.noise_level_min_gain if at_noise else search.explained_min_gain
                 left = [s for s in left if s.expected_gain > needed * best]
                 self.left = [s for s in self.left if s.expected_gain > needed * best]
         return fitted
+
+    def _promised_by_best(self, fitted: Sequence[ScreenedCandidate]) -> float:
+        """Return the gain that the promises of others are compared with [-]: that of the best fit.
+
+        Where this is far more than it promised, as where the initial states of the baseline are those of a local
+        minimum, promises are all too small, and are compared with that of the best.
+
+        Args:
+            fitted: The candidates of the last fits, as they were screened.
+        """
+        share, promise = max(
+            (c.share(self.base), s.expected_gain)
+            for c, s in zip(self.fits[len(self.fits) - len(fitted) :], fitted, strict=True)
+        )
+        best = self._best().share(self.base)
+        return promise if share == best and promise < self.search.stuck_share * share else best
 
     def _search_values(self) -> None:
         """Search the values of candidates near the best whose fits ended at the scanned value where they started."""

@@ -15,6 +15,9 @@ AIR_DENSITY = 1.2
 """Density of air at 20 degrees [kg/m^3]."""
 ROTATIONAL_DRAG = 2
 """Index of the fluid coefficient of drag against rotation."""
+TILTS = (-0.02, 0.02)
+"""Angles that are scanned [rad]: about a degree. Where something slides, simulated contacts are rough, and derivatives
+by small angles say little."""
 MIN_RADIUS = 1e-5
 """Radius of bodies on which no drag acts [m]: their drag is negligible."""
 
@@ -37,7 +40,7 @@ class GravityTilt(Effect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Angles about x and y."""
-        return tuple(Parameter(axis, "rad", 0.0, -0.5, 0.5, 0.02) for axis in "xy")
+        return tuple(Parameter(axis, "rad", 0.0, -0.5, 0.5, 0.02, scan=TILTS) for axis in "xy")
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Gravity."""

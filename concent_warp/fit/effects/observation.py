@@ -87,6 +87,10 @@ class ObservationCfg:
     scatter_offset: Positive = 0.02
     """Standard deviation of the differences of their initial states, in units of the states' spread [-]: small beside
     what is fitted, large enough to shift the instant of each later impact within a time step."""
+    chatter: Annotated[float, Bounds(0)] = 5.0
+    """Standard deviation that a residual is allowed for what changes without order from reading to reading in these
+    simulations, over its own there [-], see `NumericalScatter`; 0 for none. So large that hardly anything is left of
+    it: a model is no better for hopping less than another."""
     min_scatter: Positive = 0.1
     """Standard deviation along a direction of the residuals below which scatter is neglected [-]: a hundredth of the
     noise's variance."""
@@ -165,24 +169,38 @@ class NumericalScatter:
     A simulated contact begins at a step of the time grid, up to one step after bodies meet; the impulse, and what
     follows, depends on where between two steps they meet. No measurement can tell: what it changes is an error of the
     simulation that counts as noise, correlated over the rest of the window.
+
+    A body that slides hops in the simulation, by a fraction of a millimetre or more: soft contact laws with a convex
+    cone of friction press it off the faster it slides. Hops follow one another without order, and real bodies do not
+    hop. They are noise of each residual for itself.
     """
 
     deviations: np.ndarray = field(repr=False)
     """Deviations of the residuals, shape (count, K); their covariance is `deviations @ deviations.T`."""
+    own: np.ndarray | None = field(default=None, repr=False)
+    """Standard deviations of what each residual has for itself, shape (count,); None for nothing."""
 
     def whitened(self, residual: np.ndarray) -> np.ndarray:
-        """Return residuals (count,) in units of noise and scatter: (I + D D')^(-1/2) r."""
+        """Return residuals r (count,) in units of noise and scatter: (I + E D D' E)^(-1/2) E r, where E = (I + diag
+        own^2)^(-1/2).
+        """
         directions, variance = self._directions
+        residual = residual * self._shares
         return residual + directions @ ((1 / np.sqrt(1 + variance) - 1) * (directions.T @ residual))
 
     def rows(self, chosen: np.ndarray) -> NumericalScatter:
         """Return the scatter of some of the residuals, by their indices."""
-        return NumericalScatter(self.deviations[chosen])
+        return NumericalScatter(self.deviations[chosen], None if self.own is None else self.own[chosen])
+
+    @cached_property
+    def _shares(self) -> np.ndarray:
+        """Noise of each residual over noise and what it has for itself, shape (count,)."""
+        return np.ones(len(self.deviations)) if self.own is None else 1 / np.sqrt(1 + self.own**2)
 
     @cached_property
     def _directions(self) -> tuple[np.ndarray, np.ndarray]:
         """Orthonormal directions (count, K) of the deviations, and the variances along them (K,)."""
-        directions, size, _ = np.linalg.svd(self.deviations, full_matrices=False)
+        directions, size, _ = np.linalg.svd(self.deviations * self._shares[:, None], full_matrices=False)
         return directions, size**2
 
 

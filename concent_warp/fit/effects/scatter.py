@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
 
 
+CHATTER_DIFFERENCES = 5
+"""Consecutive second differences of which at least half must be rough [-]: an impact bends two of them."""
+
+
 def with_scatter(
     model: Model,
     windows: Sequence[Window],
@@ -58,7 +62,7 @@ def with_scatter(
     for k in rough:
         seen = np.array([prediction.observed(k, next(courses).reader, trial.values) for trial in trials[k]])
         by_impacts = impact_deviations(prediction, k, cfg, starts[k])
-        found[k] = replace(found[k], scatter=_scatter(seen, by_impacts, prediction, cfg))
+        found[k] = replace(found[k], scatter=_scatter(seen, by_impacts, prediction, cfg, windows[k]))
     return found
 
 
@@ -108,7 +112,7 @@ def _touching_dofs(m: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 
 def _scatter(
-    residuals: np.ndarray, by_impacts: np.ndarray, prediction: Prediction, cfg: ObservationCfg
+    residuals: np.ndarray, by_impacts: np.ndarray, prediction: Prediction, cfg: ObservationCfg, w: Window
 ) -> NumericalScatter | None:
     """Return the scatter of a window's residuals; None where there is little.
 
@@ -117,12 +121,42 @@ def _scatter(
         by_impacts: See `impact_deviations`.
         prediction: What simulated them.
         cfg: Settings.
+        w: The window.
     """
     most = prediction.cfg.max_residual
     valid = residuals[(np.abs(residuals) < most).all(axis=1)]
-    deviations = by_impacts
+    deviations, own = by_impacts, None
     if len(valid) >= max(cfg.scatter_samples / 2, 2):
-        deviations = np.hstack([(valid - valid.mean(axis=0)).T / np.sqrt(len(valid) - 1), by_impacts])
+        away = (valid - valid.mean(axis=0)).T / np.sqrt(len(valid) - 1)
+        deviations = np.hstack([away, by_impacts])
+        own = cfg.chatter * chatter(away, w)
+        own = own if own.max(initial=0.0) > cfg.min_scatter else None
     directions, size, _ = np.linalg.svd(deviations, full_matrices=False)
     kept = size > cfg.min_scatter
-    return NumericalScatter(directions[:, kept] * size[kept]) if kept.any() else None
+    return NumericalScatter(directions[:, kept] * size[kept], own) if kept.any() else None
+
+
+def chatter(deviations: np.ndarray, w: Window) -> np.ndarray:
+    """Return the standard deviation of what changes without order from reading to reading, shape (count,).
+
+    It is that of the second differences of three consecutive readings of a component, over sqrt(6), which is theirs for
+    independent readings: what moves steadily apart, as after an impact, has none. Of those nearby it is the median:
+    a single impact is no chatter.
+
+    Args:
+        deviations: Deviations of the residuals whose squares add up to their variances, shape (count, K).
+        w: The window; channels with missing components have none.
+    """
+    found = np.zeros(len(deviations))
+    for r in w.readings:
+        count = len(r.time)
+        if r.known is not None or count < 3:
+            continue
+        course = deviations[r.rows].reshape(count, -1, deviations.shape[1])
+        bend = course[2:] - 2 * course[1:-1] + course[:-2]
+        square = (bend**2).sum(axis=2) / 6
+        half = CHATTER_DIFFERENCES // 2
+        padded = np.pad(square, ((half + 1, half + 1), (0, 0)), mode="symmetric" if count > half + 3 else "edge")
+        near = np.lib.stride_tricks.sliding_window_view(padded, CHATTER_DIFFERENCES, axis=0)
+        found[r.rows] = np.sqrt(np.median(near, axis=2)).ravel()
+    return found

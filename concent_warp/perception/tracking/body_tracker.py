@@ -65,7 +65,7 @@ class BodyTracker:
         """Take up a given first pose if the first moment agrees with it after a small correction; return the
         agreement.
         """
-        fit = refine(renderer, views, self.shape, pose, self.cfg.align, rough=True)
+        fit = refine(renderer, views, self.shape, pose, self.cfg.align, rough=True, symmetry=self.symmetry)
         if fit is None:
             return Agreement(0, 0.0, 0.0, 0.0, 0.0)
         agreed = agreement(renderer, views, self.shape, fit.pose, fit.depth_std, self.cfg.accept)

@@ -177,6 +177,10 @@ def _smoothed(tracker: BodyTracker, video: Video, cfg: TrackCfg, name: str) -> B
         poses, covariances = smooth(time[span], bundle.measurements[span], tracker.shape.radius, cfg.smooth)
         shared = np.array([bundle.common[part[np.abs(part - t).argmin()]] for t in range(part[0], part[-1] + 1)])
         pose[span], covariance[span] = poses, covariances + shared
+    # A gap in which the velocity has jumped cannot be bridged.
+    worst = np.sqrt(np.linalg.eigvalsh(np.where(np.isfinite(covariance), covariance, 0.0)[:, :3, :3])[:, -1])
+    unknown = ~seen & (worst > cfg.accept.max_translation_std)
+    pose[unknown], covariance[unknown] = np.nan, np.nan
     textured = any(fit is not None and fit.texture for fit in tracker.fits)
     quality = _quality(tracker, np.isfinite(pose[:, 0, 0]))
     return BodyTrack(

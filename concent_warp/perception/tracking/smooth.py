@@ -60,8 +60,11 @@ def smooth(
         worst = int(surprise.argmax())
         if surprise[worst] <= chi2.ppf(cfg.surprising, 6):
             break
-        # Between two frames the impact may be near either.
-        acceleration[worst : worst + 2] = cfg.impact
+        # Between two frames the impact may be near either; in a gap before this one, anywhere.
+        first = worst
+        while first > 1 and measurements[first - 1] is None:
+            first -= 1
+        acceleration[first : worst + 2] = cfg.impact
         run = _filtered(time, measurements, radius, acceleration)
     return _backward(run)
 

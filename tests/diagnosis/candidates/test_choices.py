@@ -89,6 +89,16 @@ def test_candidates_are_fitted_until_one_leaves_less_than_half_of_what_the_basel
         assert [d[1] for d in tasks.done] == list(fitted)
 
 
+def test_promises_are_compared_with_that_of_the_best_where_it_was_far_too_small(monkeypatch):
+    fits = {n: made(n, g, ratio=r) for n, g, r in (("a", 0.9, 1.0), ("b", 0.1, 1.9), ("c", 0.1, 1.9), ("d", 0.9, 1.0))}
+    for promised, fitted in ((0.4, "abcd"), (0.5, "abc")):  # of which d promises half
+        tasks = Tasks(monkeypatch, fits)
+        order = [screened("a", promised), screened("b", 0.3), screened("c", 0.28), screened("d", 0.26)]
+        search = fits_of([], batch_size=3)
+        search._fit_in_batches(order)
+        assert [d[1] for d in tasks.done] == list(fitted)
+
+
 def test_only_promising_candidates_are_fitted_and_at_most_so_many(monkeypatch):
     fits = {n: made(n, 0.5, ratio=1.0) for n in "abcdef"}
     tasks = Tasks(monkeypatch, fits)

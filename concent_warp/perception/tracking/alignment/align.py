@@ -181,6 +181,7 @@ def refine(
             keyframes if with_texture else (),
             texture,
             final=k == count - 1,
+            symmetry=symmetry,
         )
         if fit is None:
             return None
@@ -237,6 +238,7 @@ def _linearised(
     texture: TextureCfg | None,
     *,
     final: bool,
+    symmetry: Symmetry | None = None,
 ) -> Fit | None:
     """Return all residuals at a pose."""
     renderer.place(shape.row, pose)
@@ -266,7 +268,23 @@ def _linearised(
     share = found / searched if searched else np.nan
     correlation = float(np.mean(correlations)) if correlations else np.nan
     depth_std, edge_std, texture_std = (_largest(s) for s in (scatters, edge_scatters, texture_scatters))
+    if symmetry is not None:
+        total = _without_open_turns(total, pose, symmetry)
     return Fit(pose, total, textures, depth_std, share, correlation, edge_std, texture_std)
+
+
+def _without_open_turns(normal: Normal, pose: np.ndarray, symmetry: Symmetry) -> Normal:
+    """Return the equations of depth and edges without turns about axes about which the body is round.
+
+    Facets that stand for a round surface would seem to show them.
+    """
+    axes = pose[:3, :3] @ symmetry.chosen_turns()
+    if not axes.any():
+        return normal
+    middle = pose[:3, :3] @ symmetry.centre
+    turns = np.concatenate([np.cross(middle, axes, axis=0), axes])
+    kept = np.eye(6) - turns @ np.linalg.pinv(turns, rcond=1e-6)
+    return Normal(kept.T @ normal.information @ kept, kept.T @ normal.gradient, kept.T @ normal.bias)
 
 
 def _largest(values: Sequence[float]) -> float:

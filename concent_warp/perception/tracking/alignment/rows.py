@@ -30,6 +30,14 @@ CORRELATED = 4
 """Distance from which on depth noise is independent [px]."""
 PROFILE = (-1.0, -0.6, -0.3, 0.3, 0.6, 1.0)
 """Places along the line of search, over its half length, where what is rendered is looked up [-]."""
+MIN_OWN_PLACE = 24
+"""Edges from which on a place is fitted to them alone: eight for each of its unknowns."""
+OWN_PLACE_ROUNDS = 3
+"""Rounds of reweighting of that fit."""
+NEAR = 0.015
+"""Standard deviation of its distance from the given one [m]."""
+INSIDE = 0.7
+"""Distance inside a contour at which is looked up what covers it [px]."""
 EDGE_SIDES = 8
 """Directions of an edge's normal in the image that have an error of their own."""
 BIASES = 3 + EDGE_SIDES
@@ -59,7 +67,12 @@ class Normal:
 
 
 def weighted(
-    jacobian: np.ndarray, residual: np.ndarray, least: float, cfg: AlignCfg, inflation: float = 1.0
+    jacobian: np.ndarray,
+    residual: np.ndarray,
+    least: float,
+    cfg: AlignCfg,
+    inflation: float = 1.0,
+    left: np.ndarray | None = None,
 ) -> tuple[Normal, np.ndarray, float]:
     """Return normal equations, weights (n,) and scatter of residuals (n,) with derivatives (n, 6).
 
@@ -69,9 +82,11 @@ def weighted(
         least: Least scatter, in the residual's unit.
         cfg: Settings.
         inflation: Factor of the variance for correlated residuals.
+        left: What another pose leaves of them, which scatter and weights are taken from, shape (n,); all by default.
     """
-    scatter = max(MAD * float(np.median(np.abs(residual))), least)
-    ratio = residual / (cfg.outlier_factor * scatter)
+    left = residual if left is None else left
+    scatter = max(MAD * float(np.median(np.abs(left))), least)
+    ratio = left / (cfg.outlier_factor * scatter)
     weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
     scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
     return Normal(scaled.T @ jacobian, scaled.T @ residual), weight, scatter
@@ -268,9 +283,13 @@ def edge_rows(
     good &= view.may_show(pixels)
     slack = 0.03 * shape.reach
     steps = np.array(PROFILE) * (reach + 1)
-    places = np.concatenate([pixels - 0.7 * across * contour[use, None], *(pixels + step * across for step in steps)])
+    beside = pixels - INSIDE * across * contour[use, None]
+    places = np.concatenate([beside, *(pixels + step * across for step in steps)])
     hits = renderer.cast(view.camera, places)
-    good &= hits.depth[: len(use)] > depth - slack
+    # Just inside the contour of a round shape its own surface is nearer to the camera than the contour.
+    step_inside = INSIDE * depth * float(1 / view.camera.intrinsics[[0, 1], [0, 1]].min())
+    nearer = np.where(hits.body[: len(use)] == shape.row, np.sqrt(2 * shape.reach * step_inside), 0.0)
+    good &= hits.depth[: len(use)] > depth - slack - nearer * contour[use]
     label = hits.body[len(use) :].reshape(len(steps), -1)
     # Other edges that are known to cross the line of search would be taken for this one: those of what covers the body
     # or stands behind it, and the contour beside a crease.
@@ -321,9 +340,10 @@ def _matched_edges(
     direction = np.einsum("ni,nij->nj", across[strong], projection[strong])
     jacobian = point_jacobian(points[strong], pose[:3, 3], direction)
     residual = offset[strong]
-    scatter = max(MAD * float(np.median(np.abs(residual))), cfg.min_edge_std)
-    inflation = _chain_inflation(residual, number[strong], scatter)
-    normal, weight, scatter = weighted(jacobian, residual, cfg.min_edge_std, cfg, inflation)
+    left = _unexplained(jacobian, residual, cfg)
+    scatter = max(MAD * float(np.median(np.abs(left))), cfg.min_edge_std)
+    inflation = _chain_inflation(left, number[strong], scatter)
+    normal, weight, scatter = weighted(jacobian, residual, cfg.min_edge_std, cfg, inflation, left)
     scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
     angle = np.arctan2(across[strong, 1], across[strong, 0])
     side = np.floor((angle / np.pi + 1) / 2 * EDGE_SIDES).astype(int) % EDGE_SIDES
@@ -338,6 +358,23 @@ def _matched_edges(
         normal.gradient[:] -= shared * (weight[mine] @ residual[mine]) / total
         normal.bias[:, 3 + k] = shared * least / total
     return EdgeResult(normal, scatter, found, searched)
+
+
+def _unexplained(jacobian: np.ndarray, residual: np.ndarray, cfg: AlignCfg) -> np.ndarray:
+    """Return what the place that the edges alone ask for leaves of their residuals (n,), with derivatives (n, 6).
+
+    That a body is off shifts all edges of a side alike. Were this taken for scatter and correlation of edges, their
+    weight would be the smaller the farther off it is, and depth would hold it there. Turns are not fitted: wrong edges
+    would be explained by them.
+    """
+    left = residual
+    if len(residual) < MIN_OWN_PLACE:
+        return left
+    for _ in range(OWN_PLACE_ROUNDS):
+        normal, _, _ = weighted(jacobian, residual, cfg.min_edge_std, cfg, 1.0, left)
+        information = normal.information[:3, :3] + np.eye(3) / NEAR**2
+        left = residual - jacobian[:, :3] @ np.linalg.solve(information, normal.gradient[:3])
+    return left
 
 
 def _chain_inflation(residual: np.ndarray, number: np.ndarray, scatter: float) -> float:
