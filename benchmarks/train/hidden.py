@@ -52,10 +52,25 @@ did, under weak gravity compensation by 13 mm. All are trained by default settin
 
 *Recovered*: share of what the effect costs the unaware policy that another gets back, where policies without a hidden
 effect succeed in {reference:.1%} of trials (default settings, other seeds: {first} to {last}); its interval is from
-a bootstrap over seeds and episodes, which says little with so few seeds.
+a bootstrap over seeds and episodes, which says little with so few seeds; none where there is one seed.
 
-How large the effects are was chosen by trials of two policies of seeds 40 and 44, trained without an effect: delays of
-0.1 s, a compliance of 0.004 rad/(N m), Coulomb friction of 2 N m and pads of half the friction cost them nothing.
+How large the effects are was chosen by 60 trials each of two policies of seeds 40 and 44, trained without an effect:
+delays of 0.1 s, a compliance of 0.004 rad/(N m), Coulomb friction of 2 N m and pads of half the friction cost them 0 to
+2 %.
+
+Why no policy succeeds under weak gravity compensation: the arm sags by 13 mm, so that the block is grasped higher than
+planned. In the hole the fingers come to rest on the box while the block is 7 mm above the bottom; the demonstration
+succeeds since it lets go there. A training of insertion ends with the target event, before that, and a trial counts a
+block at the bottom. *Aware* policies reach the demonstrated end, in five trials looked at. Earlier figures, 81 %
+unaware against 10 % aware, were of trials that started from the grasp that a replay without the effect has, which the
+robot never had; from such states these policies have 76 and 58 % unaware, 0 and 12 % aware. Two faults were found on
+the way, by looking at seed 50: an arm whose weight is not borne was not held by the commands of initial states, and a
+finger on the box counted as a grasp that was lost at once. The *aware* policies here are trained without them.
+
+Begun and not tried: *aware* of seed 50 under weak gravity compensation before the second mend (35 % in training);
+*aware* of seed 51 with a delay, whose model was missing; *aware* and *unaware* of seed 52 with a delay, which ended with
+the machine that they ran on. One more *aware* of seed 50 with a delay, observing five steps at once, was tried from
+other states alone: 200 of 200, as by default settings.
 """
 
 
@@ -151,7 +166,8 @@ def recovered(pairs: Sequence[tuple[Row, Row]], reference: float) -> str:
     if before >= reference:
         return "no cost"
     low, high = np.percentile(drawn, [2.5, 97.5])
-    return f"{(after - before) / (reference - before):.0%} [{low:.0%}, {high:.0%}]"
+    interval = f" [{low:.0%}, {high:.0%}]" if len(pairs) > 1 else ""
+    return f"{(after - before) / (reference - before):.0%}{interval}"
 
 
 def without_effect() -> float:
