@@ -69,8 +69,8 @@ finger on the box counted as a grasp that was lost at once. The *aware* policies
 
 Begun and not tried: *aware* of seed 50 under weak gravity compensation before the second mend (35 % in training);
 *aware* of seed 51 with a delay, whose model was missing; *aware* and *unaware* of seed 52 with a delay, which ended
-with the machine that they ran on. One more *aware* of seed 50 with a delay, observing five steps at once, was tried from
-other states alone: 200 of 200, as by default settings.
+with the machine that they ran on. One more *aware* of seed 50 with a delay, observing five steps at once, was tried
+from other states alone: 200 of 200, as by default settings.
 """
 
 

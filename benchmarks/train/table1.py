@@ -57,7 +57,9 @@ column *seeds* shows how much trainings differ.
 Used to choose settings: seeds 0 to 2; with random force perturbations seeds 0 and 3 to 5; `grasp-turn 0.6` seeds 5 to
 7; the lead scale seeds 0 and 3 to 8; `turn-lead` seeds 3 to 5. Seeds 9 to 11 were used for no choice, but smaller
 leads and more exploration, tried on them as well, did worse and were dropped. The hidden delay is the third effect
-tried, after weaker gravity compensation and joint compliance.
+tried, after weaker gravity compensation and joint compliance. Under weaker gravity compensation the initial states
+have grasps that the robot never had, those of a replay without the effect: its rows say nothing of what the effect in
+the model is worth ([later trials](train_hidden.md)).
 
 - *ours*: contact geometry fitted to the demonstration, contact-event reward.
 - *without contact geometry optimisation*: the paper's starting geometry, spheres centred on the surface. **Not
