@@ -197,6 +197,8 @@ class AdditionFinder:
 
         Refused, too, where the model leaves little more than noise in size, are those that remove little and do not so
         beside all nominal values. Sensitivities to these are those of the model that the candidates are added to.
+        Effects of sensors that remove little are refused, too, where errors of impacts do not count as noise: scales
+        and zeros of readings are as good as a calibration, and no nominal value stands for them.
         """
         found = list(findings)
         if not any(f.accepted for f in findings):
@@ -214,9 +216,12 @@ class AdditionFinder:
             share = self.context.cfg.search.dependent_share
             if not established_effects(added, parameters, share, widening, nominal)[-1]:
                 found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
-            elif quiet and f.gain < self.context.cfg.quiet_min_gain and not self._is_beside_nominal(base, c, shared):
-                reason = "removes little, and less beside nominal values within their tolerance"
-                found[k] = replace(found[k], accepted=False, reason=reason)
+            elif quiet and f.gain < self.context.cfg.quiet_min_gain:
+                if f.family == "measurement" and not self.context.record.beside_impacts:
+                    found[k] = replace(found[k], accepted=False, reason="removes little, as calibrations do")
+                elif not self._is_beside_nominal(base, c, shared):
+                    reason = "removes little, and less beside nominal values within their tolerance"
+                    found[k] = replace(found[k], accepted=False, reason=reason)
         return found
 
     def _is_as_given(self, base: FittedModel) -> bool:

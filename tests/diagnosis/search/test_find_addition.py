@@ -265,6 +265,26 @@ def test_a_small_effect_on_the_model_as_given_counts_where_nominal_values_do_not
     assert asked["min_gain"] == (least if small else 0.125)
 
 
+@pytest.mark.parametrize(
+    ("gain", "beside_impacts", "added"), [(0.07, False, None), (0.07, True, "a"), (0.13, False, "a")]
+)
+def test_a_small_effect_of_a_sensor_counts_only_beside_errors_of_impacts(monkeypatch, gain, beside_impacts, added):
+    monkeypatch.setattr(find_addition, "add_candidate", lambda _base, c: c)
+    monkeypatch.setattr(find_addition, "nominal_errors", lambda *_: None)
+    monkeypatch.setattr(find_addition, "nominal_sensitivities", lambda _base: "shared")
+    monkeypatch.setattr(find_addition, "joint_parameters", lambda *_: [(CLEAR,)])
+    monkeypatch.setattr(find_addition, "established_effects", lambda *_: [True])
+    monkeypatch.setattr(find_addition, "errors_beside_nominal_values", lambda *_: (np.full(4, 25.0), np.full(4, 23.0)))
+    plain = finding
+    monkeypatch.setitem(globals(), "finding", lambda *a, **k: replace(plain(*a, **k), family="measurement"))
+    made = procedure()
+    made.record.beside_impacts = beside_impacts
+    (best, _), _ = searched(
+        monkeypatch, made, {"a": (gain, True)}, np.zeros(10), 1.0, step=0, base=node(1.0), refitted=0.0, explained=True
+    )
+    assert (None if best is None else best.name) == added
+
+
 class Parts:
     """A search in which one candidate is a part, and notes of what it asks for."""
 

@@ -244,14 +244,14 @@ def _linearised(
     renderer.place(shape.row, pose)
     total, textures, scatters, found, searched, correlations = Normal(), [], [], 0, 0, []
     edge_scatters, texture_scatters = [], []
-    seen = False
+    seen, is_round = False, symmetry is not None and bool(symmetry.chosen_turns().any())
     for v, view in enumerate(views):
         crop = rendered_crop(renderer, view, shape, pose, cfg.max_pixels)
         if crop is None or not crop.own.any():
             continue
         seen = True
         normal, scatter, _ = depth_rows(renderer, crop, view, pose, gate, cfg, final=final)
-        edge = edge_rows(renderer, view, shape, pose, reach, cfg)
+        edge = edge_rows(renderer, view, shape, pose, reach, cfg, is_round=is_round)
         total = total + normal + edge.normal
         scatters.append(scatter)
         edge_scatters.append(edge.scatter)

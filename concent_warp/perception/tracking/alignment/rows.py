@@ -255,9 +255,19 @@ class EdgeResult:
 
 
 def edge_rows(
-    renderer: RayRenderer, view: View, shape: TrackedShape, pose: np.ndarray, reach: float, cfg: AlignCfg
+    renderer: RayRenderer,
+    view: View,
+    shape: TrackedShape,
+    pose: np.ndarray,
+    reach: float,
+    cfg: AlignCfg,
+    *,
+    is_round: bool = False,
 ) -> EdgeResult:
-    """Return the normal equations of the image's edges within `reach` [px] of contour and creases."""
+    """Return the normal equations of the image's edges within `reach` [px] of contour and creases.
+
+    For bodies that are round about an axis the scatter of edges is what a shift of the body leaves of them.
+    """
     edges = shape.edges
     points = edges.point @ pose[:3, :3].T + pose[:3, 3]
     sight = points - view.camera.position
@@ -288,7 +298,8 @@ def edge_rows(
     hits = renderer.cast(view.camera, places)
     # Just inside the contour of a round shape its own surface is nearer to the camera than the contour.
     step_inside = INSIDE * depth * float(1 / view.camera.intrinsics[[0, 1], [0, 1]].min())
-    nearer = np.where(hits.body[: len(use)] == shape.row, np.sqrt(2 * shape.reach * step_inside), 0.0)
+    own = (hits.body[: len(use)] == shape.row) & is_round
+    nearer = np.where(own, np.sqrt(2 * shape.reach * step_inside), 0.0)
     good &= hits.depth[: len(use)] > depth - slack - nearer * contour[use]
     label = hits.body[len(use) :].reshape(len(steps), -1)
     # Other edges that are known to cross the line of search would be taken for this one: those of what covers the body
@@ -298,7 +309,18 @@ def edge_rows(
     good &= ((outside == background) | ((outside == shape.row) & contour[use])).all(axis=0)
     good &= ((inside == shape.row) | (inside == background)).all(axis=0)
     return _matched_edges(
-        view, pose, points[use], pixels, across, projection, contour[use], good, edges.edge[use], reach, cfg
+        view,
+        pose,
+        points[use],
+        pixels,
+        across,
+        projection,
+        contour[use],
+        good,
+        edges.edge[use],
+        reach,
+        cfg,
+        is_round=is_round,
     )
 
 
@@ -314,6 +336,8 @@ def _matched_edges(
     number: np.ndarray,
     reach: float,
     cfg: AlignCfg,
+    *,
+    is_round: bool,
 ) -> EdgeResult:
     """Return the normal equations of samples (n, ...) at which the image has an edge."""
     searched = int((good & contour).sum())
@@ -340,7 +364,7 @@ def _matched_edges(
     direction = np.einsum("ni,nij->nj", across[strong], projection[strong])
     jacobian = point_jacobian(points[strong], pose[:3, 3], direction)
     residual = offset[strong]
-    left = _unexplained(jacobian, residual, cfg)
+    left = _unexplained(jacobian, residual, cfg) if is_round else residual
     scatter = max(MAD * float(np.median(np.abs(left))), cfg.min_edge_std)
     inflation = _chain_inflation(left, number[strong], scatter)
     normal, weight, scatter = weighted(jacobian, residual, cfg.min_edge_std, cfg, inflation, left)
@@ -363,9 +387,9 @@ def _matched_edges(
 def _unexplained(jacobian: np.ndarray, residual: np.ndarray, cfg: AlignCfg) -> np.ndarray:
     """Return what the place that the edges alone ask for leaves of their residuals (n,), with derivatives (n, 6).
 
-    That a body is off shifts all edges of a side alike. Were this taken for scatter and correlation of edges, their
-    weight would be the smaller the farther off it is, and depth would hold it there. Turns are not fitted: wrong edges
-    would be explained by them.
+    That a round body is off shifts all of its contour alike. Were this taken for scatter and correlation of edges,
+    their weight would be the smaller the farther off it is, and depth would hold it there. Turns are not fitted: wrong
+    edges would be explained by them. Where a body has edges of its own in several directions their scatter is real.
     """
     left = residual
     if len(residual) < MIN_OWN_PLACE:
