@@ -26,6 +26,7 @@ MAGNITUDES = {
     "joint_friction": 5.0,
     "load_friction": 0.3,
     "joint_damping": 20.0,
+    "joint_stiffness": 60.0,
     "armature": 0.5,
     "gravity_compensation": 0.3,
     "actuator_gain": 0.7,

@@ -114,8 +114,8 @@ def fit_effects(
 ) -> FittedEffects:
     """Fit all parameters of a model's effects together with the initial states.
 
-    Parameters at their null value that have values to scan (`Parameter.scan`, `scan_together`) start from the best of
-    these.
+    Parameters at their null value that have values to scan (`Parameter.scan`) start from the best of these; where
+    values of several at once (`scan_together`) are better still, the better of two fits counts, from either.
 
     Args:
         model: The model with effects, at the values to start from.
@@ -156,6 +156,9 @@ def fit_effects(
     report(0.3, "trial values")
     chosen = _best_start(solver, start, offsets, starts, cfg)
     fit = solver.fit(chosen, offsets, starts, lambda share: report(0.3 + 0.5 * share, "fitting"))
+    if (other := _start_together(solver, start, chosen, offsets, starts)) is not None:
+        report(0.8, "fitting from other values")
+        fit = min(fit, solver.fit(other, offsets, starts), key=lambda found: found.cost)
     report(0.8, "fitting again")
     fit = solver.polish(fit)
     linear = projected(fit, robust)
@@ -226,17 +229,41 @@ def _best_start(
                 moved = trials[0].copy()
                 moved[k] = value
                 trials.append(moved)
+    if len(trials) == 1:
+        return trials[0]
+    costs = _costs(solver, trials, offsets, starts)
+    best = int(np.argmin(costs))
+    return trials[best] if costs[best] < costs[0] - cfg.min_scan_gain else trials[0]
+
+
+def _start_together(
+    solver: Solver,
+    given: np.ndarray,
+    chosen: np.ndarray,
+    offsets: Sequence[np.ndarray],
+    starts: Sequence[np.ndarray],
+) -> np.ndarray | None:
+    """Return values (P,) of several parameters at once from which a fit may start, None if `chosen` are as good."""
+    trials = [chosen]
+    for k, parameter in enumerate(solver.p.parameters):
+        if given[k] == parameter.null:
             for row in itertools.chain.from_iterable(parameter.scan_together):
-                moved = trials[0].copy()
+                moved = np.where(np.isfinite(given), given, solver.high)
                 moved[k : k + len(row)] = row
                 trials.append(moved)
     if len(trials) == 1:
-        return trials[0]
+        return None
+    best = int(np.argmin(_costs(solver, trials, offsets, starts)))
+    return trials[best] if best else None
+
+
+def _costs(
+    solver: Solver, trials: Sequence[np.ndarray], offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
+) -> list[float]:
+    """Return the robust costs of trial values (P,), outliers as of the first."""
     residuals = [_residuals_at(solver, values, offsets, starts) for values in trials]
     limit = huber_limit(residuals[0], solver.cfg.robust)
-    costs = [sum(start_cost(r, np.zeros(1), limit, solver.cfg.robust) for r in of_trial) for of_trial in residuals]
-    best = int(np.argmin(costs))
-    return trials[best] if costs[best] < costs[0] - cfg.min_scan_gain else trials[0]
+    return [sum(start_cost(r, np.zeros(1), limit, solver.cfg.robust) for r in of_trial) for of_trial in residuals]
 
 
 def _fitted_parameters(

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 CHATTER_DIFFERENCES = 5
 """Consecutive second differences of which at least half must be rough [-]: an impact bends two of them."""
+BODIES = (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY))
+FREE_DOFS = 6
+"""Degrees of freedom of a body that moves freely."""
 
 
 def with_scatter(
@@ -129,11 +132,30 @@ def _scatter(
     if len(valid) >= max(cfg.scatter_samples / 2, 2):
         away = (valid - valid.mean(axis=0)).T / np.sqrt(len(valid) - 1)
         deviations = np.hstack([away, by_impacts])
-        own = cfg.chatter * chatter(away, w)
+        alone = _of_single_bodies(prediction.model(prediction.start).scene.model, w, len(away))
+        own = cfg.chatter * chatter(away, w) * alone
         own = own if own.max(initial=0.0) > cfg.min_scatter else None
     directions, size, _ = np.linalg.svd(deviations, full_matrices=False)
     kept = size > cfg.min_scatter
     return NumericalScatter(directions[:, kept] * size[kept], own) if kept.any() else None
+
+
+def _of_single_bodies(m: mujoco.MjModel, w: Window, count: int) -> np.ndarray:
+    """Return which residuals are of poses of bodies that move freely and alone, shape (count,) bool.
+
+    Hops of what drives and joints move, as of a leg, are motion: their size says how soft its contact is.
+    """
+    found = np.zeros(count, dtype=bool)
+    for r in w.readings:
+        sensor = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, r.channel)
+        if sensor < 0 or m.sensor_objtype[sensor] not in BODIES:
+            continue
+        body = int(m.sensor_objid[sensor])
+        dofs = m.body_rootid[m.dof_bodyid] == m.body_rootid[body]
+        joint = m.body_jntadr[m.body_rootid[body]]
+        is_free = joint >= 0 and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+        found[r.rows] = is_free and dofs.sum() == FREE_DOFS
+    return found
 
 
 def chatter(deviations: np.ndarray, w: Window) -> np.ndarray:

@@ -1,11 +1,15 @@
 """Chatter: a body that slides hops in the simulation, and no model is better for hopping less."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import mujoco
 import numpy as np
 
 from concent_warp.fit.effects.observation import NumericalScatter, ObservationCfg, Window
 from concent_warp.fit.effects.observe import observe
+from concent_warp.fit.effects.scatter import _of_single_bodies
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -57,6 +61,30 @@ def test_there_is_none_where_it_is_switched_off():
     scatter = slid(ObservationCfg(chatter=0.0)).scatter
     assert scatter is not None
     assert scatter.own is None
+
+
+def test_only_bodies_that_move_freely_and_alone_have_any():
+    m = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <worldbody>
+        <body name="block"><freejoint/><geom size="0.1"/></body>
+        <body name="walker"><freejoint/><geom size="0.1"/>
+          <body name="leg"><joint name="knee"/><geom size="0.1" pos="0 0 1"/></body>
+        </body>
+        <body name="door"><joint/><geom size="0.1" pos="1 0 0"/></body>
+      </worldbody>
+      <sensor>
+        <framepos name="a" objtype="xbody" objname="block"/><framepos name="b" objtype="body" objname="walker"/>
+        <jointpos name="c" joint="knee"/><framepos name="d" objtype="xbody" objname="door"/>
+        <framepos name="e" objtype="body" objname="block"/><framepos name="f" objtype="xbody" objname="leg"/>
+      </sensor>
+    </mujoco>""")
+    names = "abcdefg"
+    readings = [SimpleNamespace(channel=n, rows=slice(2 * k, 2 * k + 2)) for k, n in enumerate(names)]
+    window: Any = SimpleNamespace(readings=readings)
+    found = _of_single_bodies(m, window, 2 * len(names)).reshape(-1, 2)
+    assert (found[:, 0] == found[:, 1]).all()
+    assert found[:, 0].tolist() == [True, False, False, False, True, False, False]
 
 
 def test_whitening_is_the_inverse_root_of_noise_chatter_and_scatter():
