@@ -20,7 +20,7 @@ from joblib import Parallel, delayed
 
 from benchmarks.measurements import Measurements, Row
 from benchmarks.pages import machine_line, read_data, table, write_data, write_page
-from benchmarks.train.cases import CASES, TASKS, demonstrate
+from benchmarks.train.cases import CASES, TASKS, demonstrate, same_world
 from benchmarks.train.learning import RESULT
 from benchmarks.train.table1 import Args as Table1Args
 from benchmarks.train.table1 import policy_folder, trial
@@ -107,6 +107,26 @@ def true_states(args: Table1Args, seed: int) -> ResetStates:
     return judge.evaluation_states(replace(task, replay=true), args.episodes, seed)
 
 
+def trainings(args: Table1Args) -> list[tuple[str, int]]:
+    """Return case and seed of the trainings of a folder that have ended.
+
+    Raises:
+        SystemExit: There is none, or the world of one hides something else.
+    """
+    ended = [
+        (name, int(path.parent.name.rsplit("_", 1)[1]))
+        for name in OF_A_WORLD
+        for path in sorted((args.out / "runs").glob(f"{name}_{args.stage}_*/{RESULT}"))
+    ]
+    if not ended:
+        raise SystemExit(
+            f"{args.out}: no ended training of {', '.join(OF_A_WORLD)}; make them by benchmarks.train.learning"
+        )
+    for name, seed in ended:
+        same_world(args.out, [name], [seed], args.hidden)
+    return ended
+
+
 def page(rows: Sequence[Row], reference: float) -> str:
     """Return the page.
 
@@ -189,11 +209,7 @@ def main() -> None:
     for folder, effect in zip(args.folders, args.hidden, strict=True):
         kept = Measurements(folder / f"{NAME}.jsonl")
         given = Table1Args(out=folder, episodes=args.episodes, hidden=effect)
-        ended = [
-            (name, int(path.parent.name.rsplit("_", 1)[1]))
-            for name in OF_A_WORLD
-            for path in sorted((folder / "runs").glob(f"{name}_{given.stage}_*/{RESULT}"))
-        ]
+        ended = trainings(given)
         left = [one for one in ended if kept.wanted(f"{folder.name} {effect} {one[0]} {one[1]}")]
         jobs = (delayed(measure)(given, *one) for one in left)
         found = Parallel(n_jobs=args.processes, return_as="generator")(jobs)

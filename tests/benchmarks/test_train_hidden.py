@@ -42,3 +42,19 @@ def test_no_share_of_a_cost_that_is_none(hidden):
 
 def test_cost_is_measured_against_trials_with_nothing_hidden(hidden):
     assert hidden.without_effect() == pytest.approx(0.9965)
+
+
+def test_folders_without_trainings_and_of_another_effect_are_refused(hidden, tmp_path):
+    asked = hidden.Table1Args(out=tmp_path, hidden="actuator_delay=0.2")
+    with pytest.raises(SystemExit, match=r"no ended training of unaware, randomised, aware; make them"):
+        hidden.trainings(asked)
+    for case in ("aware", "unaware"):
+        run = tmp_path / "runs" / f"{case}_insert_7"
+        run.mkdir(parents=True)
+        (run / hidden.RESULT).write_text("{}")
+    assert hidden.trainings(asked) == [("unaware", 7), ("aware", 7)]
+    made = tmp_path / "models" / hidden.CASES["aware"].material(7)
+    made.mkdir(parents=True)
+    (made / "hidden.txt").write_text("joint_friction=3")
+    with pytest.raises(SystemExit, match=r"made with joint_friction=3 hidden, not actuator_delay=0\.2"):
+        hidden.trainings(asked)
