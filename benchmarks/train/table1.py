@@ -34,7 +34,7 @@ from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.run import TrainingRun
-from concent_warp.train.task.holding import holding_leads
+from concent_warp.train.task.held_arm import holding_leads
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.evaluate import run_episodes, wilson
 

@@ -16,7 +16,7 @@ from concent_warp.train.cfg import ActionCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import MujocoPhysics
 from concent_warp.train.resets.sample import sample_reset_states
-from concent_warp.train.task.holding import holding_leads
+from concent_warp.train.task.held_arm import holding_leads
 from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.task import Task
 

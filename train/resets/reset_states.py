@@ -14,7 +14,7 @@ from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.inverse_kinematics import solve_inverse_kinematics
 from concent_warp.train.resets.inverse_kinematics_batch import solve_inverse_kinematics_batch
-from concent_warp.train.task.holding import holding_commands
+from concent_warp.train.task.held_arm import holding_commands
 from concent_warp.train.task.movable_fixtures import mocap_id
 from concent_warp.train.task.task import Task
 

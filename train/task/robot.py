@@ -10,7 +10,7 @@ import numpy as np
 from concent_warp.effects.select import SINGLE, driven_joints, servo_gain
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import ActionCfg
-from concent_warp.train.task.holding import holding_leads
+from concent_warp.train.task.held_arm import holding_leads
 
 JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 DYNAMICS = mujoco.mjtDyn
