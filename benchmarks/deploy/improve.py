@@ -1,18 +1,20 @@
 """Success by round with a hidden effect, against training with the true effect, and against wide randomisation.
 
-python -m benchmarks.deploy.improve --jobs 5                       # goes on where the last run stopped
-python -m benchmarks.deploy.improve --names backlash=0.015         # some cases
-python -m benchmarks.deploy.improve --table                        # the page from the stored results
+python -m benchmarks.deploy.improve --jobs 8 --devices cuda:0 cuda:1     # goes on where the last run stopped
+python -m benchmarks.deploy.improve --names backlash=0.015               # some cases
+python -m benchmarks.deploy.improve --table                              # the page from the stored results
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from queue import Queue
 from statistics import mean, median
 from typing import Any, Literal, get_args
 
@@ -58,8 +60,9 @@ BOUNDS = (0.4, 0.8)
 INTRODUCTION = """\
 `python -m benchmarks.deploy.improve`: the insertion policy of the package in Reality, with an effect hidden in it that
 neither the model nor the policy knows. *Rounds* is `concent improve`: in each round failed trials are explained, the
-effect that is named is added to the model and fitted, and the policy is trained on. *True effect* trains on from the
-same policy, for as many iterations as all rounds together, in the model with the library's effect at its true values;
+effect that is named is added to the model and fitted, and the policy is trained on, until 95 % of a round's trials
+succeed. *True effect* trains on from the same policy, for as many iterations as the rounds of the same seed took
+together (one round's where these ended without a training), in the model with the library's effect at its true values;
 *randomised* does so in the given model with wide randomisation of friction, drives, joint friction, delay and lag. All
 are judged in the same trials, which no arm has seen. A case counts where the given policy succeeds in 40 to 80 %.
 
@@ -81,8 +84,11 @@ class Args:
     policy: str = "shape_sorter"
     """The policy to begin with."""
     rounds: int = 3
+    """Most rounds."""
+    target: float = ImproveCfg.target
+    """Share of a round's trials at which rounds end."""
     iterations: int = 100
-    """Iterations of a round; the other arms have them of all rounds."""
+    """Iterations of a round; the other arms have those of the rounds of the same seed together."""
     worlds: int | None = None
     """Parallel environments, those of the policy's training by default."""
     episodes: int = 60
@@ -91,8 +97,8 @@ class Args:
     """Trials by which arms are judged."""
     seconds: float | None = None
     """Longest search for an effect [s]; by default as long as it takes."""
-    device: str | None = None
-    """Where policies are trained; the first CUDA device by default."""
+    devices: tuple[str, ...] = ()
+    """Where policies are trained, a process each in turn; the first CUDA device by default."""
     out: Path = Path("runs/improve")
     """Where rounds and policies are kept."""
     data: Path = FOLDER / "data" / f"{NAME}.jsonl"
@@ -104,19 +110,55 @@ class Args:
 def main(args: Args) -> None:
     """Measure what is not done yet, and write the page."""
     kept = Measurements(args.data)
-    wanted = [(case, SEED + k, arm) for case in args.names for k in range(args.seeds) for arm in get_args(Arm)]
-    left = [one for one in ([] if args.table else wanted) if kept.wanted(key(*one))]
-    with ProcessPoolExecutor(max(1, min(args.jobs, len(left))), mp_context=get_context("spawn")) as pool:
-        tasks = {pool.submit(study, *one, args): key(*one) for one in left}
-        for task in as_completed(tasks):
-            try:
-                row = task.result()
-            except Exception as error:  # an arm that fails must not end the others
-                row = {"error": f"{type(error).__name__}: {error}"}
-            kept.add(tasks[task], {"machine": machine(args.device or "cpu"), **row})
+    seeds = [(case, SEED + k) for k in range(args.seeds) for case in args.names]
+    early: tuple[Arm, ...] = ("rounds", "before")
+    first: list[tuple[str, int, Arm]] = [(*one, arm) for arm in early for one in seeds]
+    left = [one for one in ([] if args.table else first) if kept.wanted(key(*one))]
+    devices: Queue[str | None] = get_context("spawn").Manager().Queue()
+    for k in range(max(1, args.jobs)):
+        devices.put(args.devices[k % len(args.devices)] if args.devices else None)
+    with ProcessPoolExecutor(max(1, args.jobs), get_context("spawn"), _begin, (devices,)) as pool:
+        running: dict[Future[dict[str, Any]], tuple[str, int, Arm]] = {}
+
+        def begin(one: tuple[str, int, Arm], iterations: int = 0) -> None:
+            running[pool.submit(study, *one, args, iterations)] = one
+
+        def follow(one: tuple[str, int]) -> None:
+            """Begin the arms that are trained for as long as the rounds of the same seed."""
+            trained = kept.rows[key(*one, "rounds")].get("trained", 0)
+            others: tuple[Arm, ...] = ("true effect", "randomised")
+            for arm in others:
+                if kept.wanted(key(*one, arm)):
+                    begin((*one, arm), max(trained, args.iterations))
+
+        for one in left:
+            begin(one)
+        for one in [] if args.table else seeds:
+            if (*one, "rounds") not in left:
+                follow(one)
+        while running:
+            for task in wait(running, return_when=FIRST_COMPLETED).done:
+                one = running.pop(task)
+                try:
+                    row = task.result()
+                except Exception as error:  # an arm that fails must not end the others
+                    row = {"error": f"{type(error).__name__}: {error}"}
+                kept.add(key(*one), {"machine": machine((args.devices or ("cpu",))[0]), **row})
+                if one[2] == "rounds":
+                    follow(one[:2])
     rows = {name: row for name, row in kept.rows.items() if "error" not in row}
     if rows and args.data == Args.data:
         write_page(NAME, page(rows))
+
+
+def _begin(devices: Queue[str | None]) -> None:
+    """Take the device of this process."""
+    global _device
+    _device = devices.get()
+
+
+_device: str | None = None
+"""Where this process trains policies."""
 
 
 def key(case: str, seed: int, arm: Arm) -> str:
@@ -124,11 +166,11 @@ def key(case: str, seed: int, arm: Arm) -> str:
     return f"{case} {seed} {arm}"
 
 
-def study(case: str, seed: int, arm: Arm, args: Args) -> dict[str, Any]:
-    """Return the success of one arm, in plain types."""
+def study(case: str, seed: int, arm: Arm, args: Args, iterations: int) -> dict[str, Any]:
+    """Return the success of one arm, in plain types; arms other than the rounds are trained for `iterations`."""
     if args.jobs > 1:
         torch.set_num_threads(1)
-    with limit_simulations(1 if args.jobs > 1 else None):
+    with limit_simulations(max(1, (os.cpu_count() or 1) // args.jobs) if args.jobs > 1 else None):
         begun, given, hidden = time.perf_counter(), load_policy(args.policy), EvaluateCfg(hide=(case,))
         row: dict[str, Any] = {"case": case, "seed": seed, "arm": arm}
         folder = args.out / case / f"{seed}_{arm.replace(' ', '_')}"
@@ -137,9 +179,9 @@ def study(case: str, seed: int, arm: Arm, args: Args) -> dict[str, Any]:
             policy, more = _rounds(given, hidden, seed, folder, args)
             row |= more
         elif arm != "before":
-            policy = _trained(given, hidden, seed, arm, folder, args)
+            policy = _trained(given, hidden, seed, arm, folder, args, iterations)
         row["seconds"] = time.perf_counter() - begun
-        found = evaluate(policy, hidden, episodes=args.trials, seed=TEST + seed, device=args.device)
+        found = evaluate(policy, hidden, episodes=args.trials, seed=TEST + seed, device=_device)
     return row | {"successes": int(found.success.sum()), "trials": len(found.success)}
 
 
@@ -147,21 +189,24 @@ def _rounds(policy: Policy, hidden: EvaluateCfg, seed: int, folder: Path, args: 
     """Return the policy of the last round, and what the rounds found."""
     jobs = 1 if args.jobs > 1 else -1
     cfg = ImproveCfg(
-        rounds=args.rounds, target=1.0, episodes=args.episodes, iterations=args.iterations, worlds=args.worlds,
+        rounds=args.rounds, target=args.target, episodes=args.episodes, iterations=args.iterations, worlds=args.worlds,
         seed=1000 * seed, explain=ExplainCfg(seconds=args.seconds, jobs=jobs, seed=seed), evaluate=hidden,
     )  # fmt: skip
-    found = improve(policy, policy.run.recording, cfg, world="reality", device=args.device, out=folder)
+    found = improve(policy, policy.run.recording, cfg, world="reality", device=_device, out=folder)
     return load_policy(Path(found.policy)), {
         "ending": found.ending,
+        "trained": args.iterations * sum("train" in one.done for one in found.rounds),
         "by round": [[one.successes, one.trials] for one in found.rounds],
         "causes": [one.cause for one in found.rounds if one.cause],
         "effects": [[effect.name for effect in one.effects] for one in found.rounds],
     }
 
 
-def _trained(policy: Policy, hidden: EvaluateCfg, seed: int, arm: Arm, folder: Path, args: Args) -> Policy:
+def _trained(
+    policy: Policy, hidden: EvaluateCfg, seed: int, arm: Arm, folder: Path, args: Args, iterations: int
+) -> Policy:
     """Return the policy trained on in the model with the true effect, or with wide randomisation."""
-    cfg = ImproveCfg(iterations=args.rounds * args.iterations, worlds=args.worlds, seed=1000 * seed)
+    cfg = ImproveCfg(iterations=iterations, worlds=args.worlds, seed=1000 * seed)
     settings, run = training_cfg(cfg, policy.run.cfg, 1), policy.run
     model = true_model(policy, hidden) if arm == "true effect" else run.model
     if arm == "randomised":
@@ -172,7 +217,7 @@ def _trained(policy: Policy, hidden: EvaluateCfg, seed: int, arm: Arm, folder: P
         settings,
         events=run.events,
         begin_with=policy,
-        device=args.device,
+        device=_device,
         out=folder,
         resume=True,
     )
