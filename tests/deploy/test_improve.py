@@ -186,6 +186,19 @@ def test_missing_effects_are_added_and_fitted_to_failed_trials(tmp_path: Path) -
     assert again.effects[1].values == pytest.approx(model.effects[1].values)
 
 
+def test_effects_are_fitted_to_the_free_motion_that_they_were_found_in(tmp_path: Path) -> None:
+    setting, one = swinging(tmp_path)
+    found_in = tmp_path / "out" / "explanation" / "free_motion.h5"
+    found_in.parent.mkdir(parents=True)
+    write_hdf5(swung(seconds=0.5), found_in)
+    damping = cw.MissingEffect("joint_damping", ("hinge",), ("damping[hinge]",), (0.5 * DAMPING,))
+    after, fitted = with_effects(setting, one, Mend("added", (damping,)), tmp_path / "out", lambda *_: None)
+    assert fitted is not None
+    assert fitted.model.effects[0].values[0] == pytest.approx(DAMPING, rel=0.1)
+    assert str(found_in) in shlex.split(after.commands[-1])
+    assert not (tmp_path / "out" / "failed.h5").exists()
+
+
 def test_effects_of_the_model_are_fitted_again_by_a_command_too(tmp_path: Path) -> None:
     setting, one = swinging(tmp_path, "joint_damping")
     (tmp_path / "out").mkdir()

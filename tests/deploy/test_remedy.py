@@ -15,9 +15,10 @@ from concent_warp.deploy.explain.result import Cause
 FOUND = cast(Any, SimpleNamespace(accepted=[SimpleNamespace(name="joint_friction(joint1, ...)")] * 2))
 
 
+@pytest.mark.parametrize("free", [None, "out/free motion.h5"])
 @pytest.mark.parametrize("cause", ["perception", "physics", "policy", "unexplained"])
-def test_commands_are_understood(cause: Cause) -> None:
-    lines = remedy(cw.load_policy("shape_sorter"), cause, FOUND, ["my trials.h5"])
+def test_commands_are_understood(cause: Cause, free: str | None) -> None:
+    lines = remedy(cw.load_policy("shape_sorter"), cause, FOUND, ["my trials.h5"], free)
     commands = [shlex.split(line) for line in lines if not line.startswith("#")]
     assert len(commands) >= 2
     for concent, name, *arguments in commands:
@@ -26,3 +27,4 @@ def test_commands_are_understood(cause: Cause) -> None:
         given = tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.HelptextFromCommentsOff,))
         if name == "diagnose":
             assert given.effects == ("joint_friction",)
+            assert [str(path) for path in given.recording] == [free or "my trials.h5"]

@@ -62,6 +62,8 @@ class Evidence:
     starts: tuple[MeasuredStart, ...] = ()
     """Starts of the trials without it, where it was accepted."""
     diagnosis: Diagnosis | None = None
+    free_motion: str | None = None
+    """File of the free motion that the effect was searched in, where it was and this was written."""
     misfit_with_effect: np.ndarray | None = None
     """Misfit with the missing effect, shape (T,)."""
     with_cause: SimulatedTrials | None = None
@@ -156,7 +158,7 @@ class Judge:
             total=total,
             evidence=numbers,
             remarks=tuple(self._remarks(evidence, cause, numbers)),
-            remedy=remedy(self._policy, cause, evidence.diagnosis, sources),
+            remedy=remedy(self._policy, cause, evidence.diagnosis, sources, evidence.free_motion),
             diagnosis=evidence.diagnosis,
             bias=evidence.bias,
             simulated=evidence.own.recording,

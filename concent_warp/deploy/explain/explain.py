@@ -29,6 +29,7 @@ from concent_warp.errors import ConcentError, ModelError, RecordingError, TrainE
 from concent_warp.files import write_json
 from concent_warp.model import Model
 from concent_warp.recording.cut import beginning
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.run_folder import make_folder
 from concent_warp.train.environment.observation import ObservationLayout
@@ -82,8 +83,8 @@ def explain(
     return found
 
 
-RESULT = "explanation.json"
-"""File of the result."""
+RESULT, FREE_MOTION = "explanation.json", "free_motion.h5"
+"""Files of the result, and of the robot's free motion in the trials if the effect was searched for in it."""
 
 
 class _Explaining:
@@ -201,6 +202,7 @@ class _Explaining:
         if judge.moves_otherwise(evidence):
             names = names or _robot_effects()
             recording = self._free_motion([*evidence.trials, *others])
+            evidence = replace(evidence, free_motion=self._write(recording))
         else:
             recording = _joined([d for _, d in self._chosen[: cfg.diagnose_trials]], self._recordings[0])
         settings = DiagnoseCfg(
@@ -226,6 +228,15 @@ class _Explaining:
         first = self._recordings[0]
         parts = [beginning(_joined([t.demonstration], first), t.free_time).demonstrations[0] for t in free]
         return _joined(parts, first)
+
+    def _write(self, free_motion: Recording) -> str | None:
+        """Write the free motion where there is a folder for it, and return the file."""
+        if self._out is None:
+            return None
+        path = Path(self._out) / FREE_MOTION
+        make_folder(path.parent)
+        write_hdf5(free_motion, path)
+        return str(path)
 
     def _possible(self, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
         """Return those of some effects that could be missing in the model.

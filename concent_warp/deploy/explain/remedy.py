@@ -27,7 +27,13 @@ SETTINGS: Mapping[Cause, Mapping[str, Any]] = {
 """Settings of a training that mend a cause, by dotted name."""
 
 
-def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: Sequence[str]) -> tuple[str, ...]:
+def remedy(
+    policy: Policy,
+    cause: Cause,
+    diagnosis: Diagnosis | None,
+    sources: Sequence[str],
+    free_motion: str | None = None,
+) -> tuple[str, ...]:
     """Return commands that mend a cause, each on the line after a comment.
 
     Args:
@@ -35,10 +41,12 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
         cause: Why its trials failed.
         diagnosis: What was found of missing effects.
         sources: Recordings of the trials.
+        free_motion: Recording of the robot's free motion in the trials, if the effect was searched for in it.
     """
     folder = policy.folder
     model, demonstration = shlex.quote(str(folder / MODEL)), shlex.quote(str(folder / DEMONSTRATION))
     trials = shlex.quote(sources[0])
+    searched = trials if free_motion is None else shlex.quote(free_motion)
     if cause == "perception":
         return (
             "# calibrate the camera again, with the robot in view, and track with it",
@@ -51,7 +59,7 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
         names = " --effects " + " ".join(dict.fromkeys(accepted)) if accepted else ""
         return (
             "# add the missing effect to the model, with its intervals",
-            f"concent diagnose {trials} --model {model}{names} --apply better.toml",
+            f"concent diagnose {searched} --model {model}{names} --apply better.toml",
             "# train again in the better model",
             f"concent train {demonstration} --model better.toml --out runs/better",
         )

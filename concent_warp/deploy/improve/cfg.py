@@ -34,8 +34,8 @@ class ImproveCfg:
     worlds: Worlds | None = None
     """Parallel environments; by default as many as the given policy was trained in."""
     fit_trials: Count = 4
-    """Failed trials to which the effects of the model are fitted; the effect is searched for in fewer, see
-    `ExplainCfg.diagnose_trials`."""
+    """Failed trials to which the effects of the model are fitted, where none is found in free motion; the effect is
+    searched for in fewer, see `ExplainCfg.diagnose_trials`."""
     min_fall: Share = 0.05
     """Share of the squared residual that a fit of the model's own effects must explain where no new one is missing [-]:
     less is no reason to train again."""

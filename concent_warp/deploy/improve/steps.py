@@ -12,7 +12,7 @@ from typing import Any
 from concent_warp.deploy.cfg import EvaluateCfg
 from concent_warp.deploy.evaluate import evaluate
 from concent_warp.deploy.explain.cfg import ExplainCfg
-from concent_warp.deploy.explain.explain import explain
+from concent_warp.deploy.explain.explain import FREE_MOTION, explain
 from concent_warp.deploy.explain.page import write_explanation
 from concent_warp.deploy.improve.cfg import ImproveCfg
 from concent_warp.deploy.improve.mend import Mend, missing_effects
@@ -163,22 +163,28 @@ def explained(setting: Setting, one: ImprovementRound, folder: Path, report: Rep
 def with_effects(
     setting: Setting, one: ImprovementRound, chosen: Mend, folder: Path, report: Report
 ) -> tuple[ImprovementRound, FittedEffects | None]:
-    """Return a round with the model of the next policy written, and the fit of its effects; None without effects."""
+    """Return a round with the model of the next policy written, and the fit of its effects; None without effects.
+
+    They are fitted to the free motion that the missing effect was found in, or else to failed trials.
+    """
     given = Path(one.policy) / MODEL
     model, commands = Model.load(given), []
     if not chosen.effects and not chosen.refit:
         return one, None
-    failed, out = _failed_trials(setting, one, folder / FAILED), folder / MODEL
+    trials, out = folder / EXPLANATION / FREE_MOTION, folder / MODEL
+    if not trials.is_file():
+        trials = folder / FAILED
+        _write_failed_trials(setting, one, trials)
     for k, effect in enumerate(chosen.effects):
         values = dict(zip(effect.parameters, effect.values, strict=True))
         model = model.add_effect(effect.name, effect.target, values)
         last = k + 1 == len(chosen.effects)
         target = out if last else folder / f"with_{k + 1}_effects.toml"
-        commands.append(_add_command(effect, given, target, folder / FAILED if last else None))
+        commands.append(_add_command(effect, given, target, trials if last else None))
         given = target
     if chosen.refit:
-        commands.append(_add_command(None, given, out, folder / FAILED))
-    fitted = fit_effects(model, failed, out=out, progress=report)
+        commands.append(_add_command(None, given, out, trials))
+    fitted = fit_effects(model, load_recording(trials), out=out, progress=report)
     before = len(model.effects) - len(chosen.effects)
     found = tuple(
         MissingEffect(added.effect.name, added.effect.target, tuple(p.name for p in parameters), added.values)
@@ -188,23 +194,21 @@ def with_effects(
     return replace(one, fitted=found, commands=(*one.commands, *commands)), fitted
 
 
-def _failed_trials(setting: Setting, one: ImprovementRound, path: Path) -> Recording:
-    """Return the first failed trials of a round as one recording, written to a file."""
+def _write_failed_trials(setting: Setting, one: ImprovementRound, path: Path) -> None:
+    """Write the first failed trials of a round as one recording."""
     every = merged([load_recording(name) for name in one.files])
     failed = [replace(d, policy=None) for d in every.demonstrations if not d.success][: setting.cfg.fit_trials]
-    recording = replace(every, demonstrations=tuple(failed))
-    write_hdf5(recording, path)
-    return recording
+    write_hdf5(replace(every, demonstrations=tuple(failed)), path)
 
 
-def _add_command(effect: MissingEffect | None, given: Path, out: Path, failed: Path | None) -> str:
+def _add_command(effect: MissingEffect | None, given: Path, out: Path, trials: Path | None) -> str:
     """Return the command that adds an effect to a model, or fits the effects that it has."""
     words = ["concent", "add"]
     if effect is not None:
         words += [effect.name, *(["--target", *effect.target] if effect.target else [])]
         if effect.parameters:
             words += ["--set", *(f"{n}={v!r}" for n, v in zip(effect.parameters, effect.values, strict=True))]
-    words += ["--model", str(given), *([] if failed is None else ["--fit", str(failed)]), "--out", str(out)]
+    words += ["--model", str(given), *([] if trials is None else ["--fit", str(trials)]), "--out", str(out)]
     return shlex.join(words)
 
 
