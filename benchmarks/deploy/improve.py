@@ -45,7 +45,7 @@ TEST = 900_000
 """Seed of the trials by which all arms are judged."""
 Arm = Literal["before", "rounds", "true effect", "randomised"]
 CASES = (
-    "joint_friction=4", "stribeck_friction=4", "joint_damping=30", "gravity_compensation=0.2", "actuator_delay=0.15",
+    "joint_friction=3", "stribeck_friction=4", "joint_damping=30", "gravity_compensation=0.2", "actuator_delay=0.15",
     "actuator_lag=0.2", "actuator_gain=0.2", "backlash=0.015",
 )  # fmt: skip
 """Hidden effects, with the magnitude in the unit of their main parameter."""
@@ -79,6 +79,8 @@ class Args:
     """Hidden effects, name=value."""
     seeds: int = 5
     """Seeds of each."""
+    arms: tuple[Arm, ...] = get_args(Arm)
+    """Arms to measure; *true effect* and *randomised* need *rounds*."""
     jobs: int = 1
     """Arms at a time, a process each."""
     policy: str = "shape_sorter"
@@ -87,8 +89,9 @@ class Args:
     """Most rounds."""
     target: float = ImproveCfg.target
     """Share of a round's trials at which rounds end."""
-    iterations: int = 100
-    """Iterations of a round; the other arms have those of the rounds of the same seed together."""
+    iterations: int = 50
+    """Iterations of a round, half of those that the policy was trained for; the other arms have those of all rounds of
+    the same seed."""
     worlds: int | None = None
     """Parallel environments, those of the policy's training by default."""
     episodes: int = 60
@@ -112,7 +115,7 @@ def main(args: Args) -> None:
     kept = Measurements(args.data)
     seeds = [(case, SEED + k) for k in range(args.seeds) for case in args.names]
     early: tuple[Arm, ...] = ("rounds", "before")
-    first: list[tuple[str, int, Arm]] = [(*one, arm) for arm in early for one in seeds]
+    first: list[tuple[str, int, Arm]] = [(*one, arm) for arm in early if arm in args.arms for one in seeds]
     left = [one for one in ([] if args.table else first) if kept.wanted(key(*one))]
     devices: Queue[str | None] = get_context("spawn").Manager().Queue()
     for k in range(max(1, args.jobs)):
@@ -125,10 +128,10 @@ def main(args: Args) -> None:
 
         def follow(one: tuple[str, int]) -> None:
             """Begin the arms that are trained for as long as the rounds of the same seed."""
-            trained = kept.rows[key(*one, "rounds")].get("trained", 0)
             others: tuple[Arm, ...] = ("true effect", "randomised")
-            for arm in others:
-                if kept.wanted(key(*one, arm)):
+            trained = kept.rows.get(key(*one, "rounds"), {}).get("trained", -1)
+            for arm in others if trained >= 0 else ():
+                if arm in args.arms and kept.wanted(key(*one, arm)):
                     begin((*one, arm), max(trained, args.iterations))
 
         for one in left:
