@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -121,6 +122,7 @@ FAR = np.full(8, 7.0)
         ({"misfit": FAR, "bias": bias(gain=0.1)}, "unexplained"),
         ({"misfit": FAR, "bias": bias(shift=-0.002)}, "unexplained"),
         ({"misfit": FAR, "bias": bias(p=0.3), "free": np.full(8, 30.0)}, "physics"),
+        ({"misfit": FAR[:1], "usual": np.ones(4), "free": np.full(1, 30.0)}, "physics"),
         ({"misfit": FAR, "bias": bias(p=0.3), "misfit_with_effect": np.full(8, 1.2)}, "physics"),
         ({"misfit": FAR, "bias": bias(p=0.3), "diagnosis": named("joints", 0.8)}, "physics"),
         ({"misfit": FAR, "bias": bias(p=0.3), "diagnosis": named("measurement", 0.8)}, "perception"),
@@ -146,13 +148,16 @@ def test_poses_are_doubted_unless_the_policy_fails_from_credible_starts_or_free_
 
 
 def test_free_motion_ends_before_the_object_comes_near_anything(
-    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]], tmp_path: Path
 ) -> None:
     touching, moving = prepared[1]
     moving = replace(moving, free_error=9.0, free_time=0.6)
     assert touching.free_error is None  # 12 mm too low, it touches from the start
     given = Recording(policy.run.recording.scene, (moving.demonstration,))
-    found = _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, None)._free_motion([touching, moving])
+    explaining = _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, tmp_path / "out")
+    found = explaining._free_motion([touching, moving])
+    assert explaining._write(found) == str(tmp_path / "out" / "free_motion.h5")
+    assert cw.load_recording(tmp_path / "out" / "free_motion.h5")[0].measured.keys() == found[0].measured.keys()
     assert len(found.demonstrations) == 1
     ends = [float(channel.time[-1]) for channel in found.demonstrations[0].measured.values()]
     assert 0.4 < max(ends) <= 0.6 < moving.readings.end
@@ -165,6 +170,13 @@ def test_trials_that_all_succeeded_are_refused(
     recording = Recording(policy.run.model.scene.xml, (trial,), "good")
     with pytest.raises(cw.RecordingError, match="no trial failed"):
         cw.explain(policy, recording)
+
+
+def test_few_trials_are_simulated_often_enough_to_be_judged(policy: cw.Policy, tmp_path: Path) -> None:
+    slow = policy.scaled(action_scale=0.05)
+    trials = cw.load_recording(cw.evaluate(slow, episodes=1, device="cpu", record=tmp_path).recorded)
+    found = cw.explain(slow, trials, cw.ExplainCfg(repetitions=1, simulated=4, diagnose=False))
+    assert "of 4 episodes" in found.remarks[0]
 
 
 def test_a_trial_without_tracked_poses_is_refused(

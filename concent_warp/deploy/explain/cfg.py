@@ -132,13 +132,14 @@ class ExplainCfg:
     """
 
     repetitions: Count = 4
-    """Episodes in the policy's own simulation from the start of each trial."""
+    """Episodes in the policy's own simulation from the start of each trial; more where the trials are so few that there
+    would be less than `simulated`."""
     most_trials: Count = 12
     """Most failed trials that are explained, the first ones."""
     successes: Annotated[int, Bounds(0, 10_000)] = 4
     """Most successful trials whose free motion is judged besides: failed ones may have little of it."""
     simulated: Count = 24
-    """Simulated trials that the others are compared with."""
+    """Simulated trials that the others are compared with; of few, a single trial that differs is not significant."""
     diagnose: bool = True
     """Whether the missing physical effect is searched for, which takes minutes."""
     diagnose_trials: Count = 2

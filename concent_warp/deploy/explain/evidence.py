@@ -91,7 +91,12 @@ class Judge:
         return max(float(np.quantile(evidence.usual, QUANTILE)), self._cfg.least_ratio * evidence.level)
 
     def differs(self, evidence: Evidence) -> bool:
-        """Return whether the trials together differ from their replays more than simulated ones do (rank-sum test)."""
+        """Return whether the trials together differ from the model more than simulated ones do.
+
+        They do where the joints differ in free motion, or the misfits of the replays are larger by a rank-sum test.
+        """
+        if self.moves_otherwise(evidence):
+            return True
         larger = float(np.median(evidence.misfit)) > self._cfg.least_ratio * evidence.level
         found = mannwhitneyu(evidence.misfit, evidence.usual, alternative="greater")
         return larger and bool(found.pvalue <= self._cfg.significance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -110,7 +111,8 @@ class _Explaining:
             )
         self._failed, self._chosen = len(failed), failed[: cfg.most_trials]
         self._succeeded = [d for r in recordings for d in r.demonstrations if d.success][: cfg.successes]
-        self._own = OwnSimulation(policy, cfg.repetitions, cfg.seed)
+        enough = math.ceil(cfg.simulated / (len(self._chosen) + len(self._succeeded)))
+        self._own = OwnSimulation(policy, max(cfg.repetitions, enough), cfg.seed)
         self._preparation = Preparation(self._own.task, policy.run.model.scene.model, cfg)
 
     def run(self) -> Explanation:
