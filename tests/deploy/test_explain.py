@@ -174,7 +174,9 @@ def test_trials_that_all_succeeded_are_refused(
 
 def test_few_trials_are_simulated_often_enough_to_be_judged(policy: cw.Policy, tmp_path: Path) -> None:
     slow = policy.scaled(action_scale=0.05)
-    trials = cw.load_recording(cw.evaluate(slow, episodes=1, device="cpu", record=tmp_path).recorded)
+    recorded = cw.evaluate(slow, episodes=1, device="cpu", record=tmp_path).recorded
+    assert recorded is not None
+    trials = cw.load_recording(recorded)
     found = cw.explain(slow, trials, cw.ExplainCfg(repetitions=1, simulated=4, diagnose=False))
     assert "of 4 episodes" in found.remarks[0]
 
