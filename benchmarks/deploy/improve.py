@@ -79,6 +79,8 @@ class Args:
     """Hidden effects, name=value."""
     seeds: int = 5
     """Seeds of each."""
+    first: int = SEED
+    """The first one, so that several commands can share the work."""
     arms: tuple[Arm, ...] = get_args(Arm)
     """Arms to measure; *true effect* and *randomised* need *rounds*."""
     jobs: int = 1
@@ -113,7 +115,7 @@ class Args:
 def main(args: Args) -> None:
     """Measure what is not done yet, and write the page."""
     kept = Measurements(args.data)
-    seeds = [(case, SEED + k) for k in range(args.seeds) for case in args.names]
+    seeds = [(case, args.first + k) for k in range(args.seeds) for case in args.names]
     early: tuple[Arm, ...] = ("rounds", "before")
     first: list[tuple[str, int, Arm]] = [(*one, arm) for arm in early if arm in args.arms for one in seeds]
     left = [one for one in ([] if args.table else first) if kept.wanted(key(*one))]
