@@ -26,16 +26,23 @@ def rows(before: int) -> dict[str, Any]:
 
 def test_the_page_sets_the_arms_side_by_side() -> None:
     text = page(rows(60))
-    assert "1 of 1 cases and seeds count" in text
+    assert "1 of 1 cases and seeds with all arms count" in text
     assert "| rounds | 90 of 100 | 83% to 94% | 94%, at least 94% |" in text
-    assert "60% 90%" in text
-    assert "1 of 1 |" in text
+    assert "| backlash=0.015 | 1 | 60% (60 of 100) | 90% (90 of 100) | - | - | 1 of 1 |" in text
+    assert "| backlash=0.015 | 1 | 60.0% | backlash | 60 of 100, 90 of 100 | 90.0% |" in text
 
 
 def test_cases_in_which_the_given_policy_is_good_do_not_count() -> None:
     text = page(rows(95))
-    assert "0 of 1 cases and seeds count" in text
-    assert "| rounds | 0 of 0 | - | - |" in text
+    assert "0 of 1 cases and seeds with all arms count" in text
+    assert "| rounds | 0 of" not in text
+
+
+def test_rounds_whose_last_policy_was_not_judged_count_by_their_own_trials() -> None:
+    found = {name: row for name, row in rows(60).items() if row["arm"] in ("before", "rounds")}
+    rounds = next(row for row in found.values() if row["arm"] == "rounds")
+    del rounds["successes"], rounds["trials"]
+    assert "| backlash=0.015 | 1 | 60.0% | backlash | 60 of 100, 90 of 100 | - |" in page(found)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -144,9 +144,11 @@ class ExplainCfg:
     """Whether the missing physical effect is searched for, which takes minutes."""
     diagnose_trials: Count = 2
     """Failed trials that it is searched for in, where the joints do not differ in free motion."""
-    free_trials: Count = 4
-    """Trials, failed ones first, that it is searched for in up to their first contact, where the joints differ in free
-    motion: without contacts it is found in less time, and nothing else can be the reason."""
+    free_trials: Count = 6
+    """Trials that it is searched for in up to their first contact, where the joints differ in free motion, those with
+    the longest: without contacts it is found in less time, and nothing else can be the reason."""
+    free_pool: Count = 64
+    """Further trials, failed and successful ones, among which these are looked for."""
     effects: tuple[str, ...] = ()
     """Effects to consider; by default those of joints and drives where the joints differ in free motion, else all."""
     additions: Annotated[int, Bounds(1, 10)] = 1

@@ -110,7 +110,9 @@ class _Explaining:
                 found=f"{sum(len(r.demonstrations) for r in recordings)} successful ones",
             )
         self._failed, self._chosen = len(failed), failed[: cfg.most_trials]
-        self._succeeded = [d for r in recordings for d in r.demonstrations if d.success][: cfg.successes]
+        succeeded = [d for r in recordings for d in r.demonstrations if d.success]
+        self._succeeded = succeeded[: cfg.successes]
+        self._further = [*(d for _, d in failed[cfg.most_trials :]), *succeeded[cfg.successes :]][: cfg.free_pool]
         enough = math.ceil(cfg.simulated / (len(self._chosen) + len(self._succeeded)))
         self._own = OwnSimulation(policy, max(cfg.repetitions, enough), cfg.seed)
         self._preparation = Preparation(self._own.task, policy.run.model.scene.model, cfg)
@@ -148,7 +150,7 @@ class _Explaining:
     ) -> Evidence:
         """Return how far the replays of trials, and of those of the own simulation, are from what was measured."""
         step = max(1, len(own.recording.demonstrations) // self._cfg.simulated)
-        simulated = self._preparation.simulated(own.recording.demonstrations[::step])
+        simulated = self._preparation.usable(own.recording.demonstrations[::step])
         replayer, contact = self._preparation.replayer, self._preparation.contact
         scale = max(1.0, float(np.median([t.joint_error for t in simulated]))) if simulated else JOINT_SCALE
         width = self._cfg.judge.window
@@ -203,7 +205,8 @@ class _Explaining:
         cfg, names = self._cfg, self._cfg.effects
         if judge.moves_otherwise(evidence):
             names = names or _robot_effects()
-            recording = self._free_motion([*evidence.trials, *others])
+            self._progress(0.45, "finding the longest free motion")
+            recording = self._free_motion([*evidence.trials, *others, *self._preparation.usable(self._further)])
             evidence = replace(evidence, free_motion=self._write(recording))
         else:
             recording = _joined([d for _, d in self._chosen[: cfg.diagnose_trials]], self._recordings[0])
@@ -225,10 +228,13 @@ class _Explaining:
         return replace(evidence, diagnosis=diagnosis, misfit_with_effect=explained)
 
     def _free_motion(self, trials: Sequence[PreparedTrial]) -> Recording:
-        """Return trials up to where the object comes near anything but the hand."""
-        free = [t for t in trials if t.free_error is not None][: self._cfg.free_trials]
+        """Return trials up to where the object comes near anything but the hand, those in which this takes longest."""
+        free = sorted((t for t in trials if t.free_error is not None), key=lambda t: -t.free_time)
         first = self._recordings[0]
-        parts = [beginning(_joined([t.demonstration], first), t.free_time).demonstrations[0] for t in free]
+        parts = [
+            beginning(_joined([t.demonstration], first), t.free_time).demonstrations[0]
+            for t in free[: self._cfg.free_trials]
+        ]
         return _joined(parts, first)
 
     def _write(self, free_motion: Recording) -> str | None:

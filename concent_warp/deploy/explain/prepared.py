@@ -89,8 +89,8 @@ class Preparation:
         free_error = _rms(joints[:free]) if judged else None
         return PreparedTrial(demonstration, readings, measured, start, move, _rms(joints), free_error, end)
 
-    def simulated(self, demonstrations: Sequence[Demonstration]) -> list[PreparedTrial]:
-        """Return simulated trials made ready, without those that ended at once."""
+    def usable(self, demonstrations: Sequence[Demonstration]) -> list[PreparedTrial]:
+        """Return trials made ready, without those that lack readings, as they do where they ended at once."""
         found = []
         for demonstration in demonstrations:
             try:
