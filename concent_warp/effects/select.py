@@ -139,6 +139,42 @@ def surfaces(m: mujoco.MjModel, body: int) -> np.ndarray:
     return ids[(m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)]
 
 
+def touchable_pairs(m: mujoco.MjModel) -> np.ndarray:
+    """Return which geoms MuJoCo lets touch, by their masks and bodies, shape (ngeom, ngeom) bool, symmetric."""
+    kind, affinity = m.geom_contype, m.geom_conaffinity
+    masks = (kind[:, None] & affinity[None]) | (affinity[:, None] & kind[None])
+    weld = m.body_weldid[m.geom_bodyid]
+    found = (masks != 0) & (weld[:, None] != weld[None])
+    if not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        above = m.body_weldid[m.body_parentid[weld]]
+        carried = (above[:, None] == weld[None]) & (above[:, None] != 0)
+        found &= ~(carried | carried.T)
+    for signature in m.exclude_signature:
+        one, other = m.geom_bodyid == int(signature) >> 16, m.geom_bodyid == int(signature) & 0xFFFF
+        found &= ~(one[:, None] & other[None] | other[:, None] & one[None])
+    return found
+
+
+def jointed_contact_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+    """Return selections of bodies on joints that can touch one another, or what stands still: a finger and a door.
+
+    Bodies that can touch the same are one selection. There is none where a body moves freely: what it touches, and what
+    stands still, is that of its own contacts.
+    """
+    if free_bodies(m):
+        return ()
+    touching, body = touchable_pairs(m), m.body_weldid[m.geom_bodyid]
+    group = np.arange(m.nbody)
+    for one, other in np.unique(body[np.argwhere(touching)], axis=0):
+        group[group == group[other]] = group[one]
+    moving = [b for b in np.unique(body[touching.any(axis=0)]) if b]
+    found = (
+        tuple(n for b in moving if group[b] == g and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        for g in dict.fromkeys(int(group[b]) for b in moving)
+    )
+    return tuple(names for names in found if names)
+
+
 def sensors_by_type(m: mujoco.MjModel, kinds: tuple[int, ...]) -> tuple[str, ...]:
     """Return the names of the sensors of some kinds."""
     return tuple(
