@@ -129,7 +129,7 @@ class LocalPolynomial:
     @property
     def std(self) -> float:
         """Noise of a component: the median scatter of the readings about their polynomials."""
-        return float(np.median(self.scatter(self.time)))
+        return float(np.median([fit.scatter for fit in self.fits(self.time)]))
 
     def fits(self, time: np.ndarray) -> list[LocalFit]:
         """Return the polynomials about each of `time` (T,) [s]."""
@@ -145,12 +145,15 @@ class LocalPolynomial:
         return _with_rate_sensor(self.fits(time), self.velocity, time)
 
     def scatter(self, time: np.ndarray) -> np.ndarray:
-        """Return the root mean square distance of the readings around each time from their polynomial, shape (T,)."""
-        return np.array([fit.scatter for fit in self.fits(time)])
+        """Return the root mean square distance of the readings around each time from one polynomial, shape (T,).
+
+        They are those on both sides: it is large where an impact lies among them, though one side may be smooth.
+        """
+        return np.array([self._around(float(now)).scatter for now in time])
 
     def acceleration(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the second derivative from readings on both sides of each time (T, n), its standard error (T,)."""
-        fits = [self._local_fit(_neighbourhoods(self.cfg, self.time, float(t), self.degree)[0], float(t)) for t in time]
+        fits = [self._around(float(now)) for now in time]
         return np.array([fit.derivatives[2] for fit in fits]), np.array([fit.errors[2] for fit in fits])
 
     def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
@@ -166,6 +169,10 @@ class LocalPolynomial:
             self.cfg,
             [self._local_fit(rows, now) for rows in _neighbourhoods(self.cfg, self.time, now, self.degree)],
         )
+
+    def _around(self, now: float) -> LocalFit:
+        """Return the polynomial through the readings on both sides of a time."""
+        return self._local_fit(_neighbourhoods(self.cfg, self.time, now, self.degree)[0], now)
 
     def _local_fit(self, rows: slice, now: float) -> LocalFit:
         """Return the polynomial through some readings."""
@@ -192,7 +199,7 @@ class LocalPolynomialOrientation:
     @property
     def std(self) -> float:
         """Noise of a component of the rotation vector [rad]: the median scatter of the readings."""
-        return float(np.median(self.scatter(self.time)))
+        return float(np.median([fit.scatter for fit in self.fits(self.time)]))
 
     def fits(self, time: np.ndarray) -> list[LocalFit]:
         """Return the polynomials of the rotation vector [rad] about each of `time` (T,) [s]."""
@@ -217,8 +224,11 @@ class LocalPolynomialOrientation:
         return _with_rate_sensor(self.fits(time), self.velocity, time)
 
     def scatter(self, time: np.ndarray) -> np.ndarray:
-        """Return the root mean square distance of the readings around each time from their polynomial [rad], (T,)."""
-        return np.array([fit.scatter for fit in self.fits(time)])
+        """Return the root mean square distance of the readings around each time from one polynomial [rad], (T,).
+
+        They are those on both sides: it is large where an impact lies among them, though one side may be smooth.
+        """
+        return np.array([self._fits_about(float(now))[0].scatter for now in time])
 
     def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
         """Return quaternion (1 + count, T, 4) and angular velocity (1 + count, T, 3) at `time` (T,), then samples."""
@@ -236,14 +246,15 @@ class LocalPolynomialOrientation:
 
     def _fit(self, now: float) -> LocalFit:
         """Return the polynomial about a time."""
+        return _best_fit(self.cfg, self._fits_about(now))
+
+    def _fits_about(self, now: float) -> list[LocalFit]:
+        """Return the polynomials through the readings on both sides of a time, and on either."""
         middle = self._nearest(now).inv()
-        return _best_fit(
-            self.cfg,
-            [
-                _local_fit(self.time[rows] - now, (middle * self.rotation[rows.start : rows.stop]).as_rotvec(), 2)
-                for rows in _neighbourhoods(self.cfg, self.time, now, 2)
-            ],
-        )
+        return [
+            _local_fit(self.time[rows] - now, (middle * self.rotation[rows.start : rows.stop]).as_rotvec(), 2)
+            for rows in _neighbourhoods(self.cfg, self.time, now, 2)
+        ]
 
 
 def _with_rate_sensor(fits: Sequence[LocalFit], velocity: LocalPolynomial | None, time: np.ndarray) -> np.ndarray:
