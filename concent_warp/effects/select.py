@@ -14,6 +14,8 @@ SENSOR = mujoco.mjtSensor
 SINGLE = (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_SLIDE))
 BEARINGS = (*SINGLE, int(JOINT.mjJNT_BALL))
 POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
+PARALLEL = 1e-3
+"""Part of an axis across others below which they are parallel [-]."""
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
 
 
@@ -121,6 +123,20 @@ def outermost_links(m: mujoco.MjModel) -> list[int]:
 def moving_as_one(m: mujoco.MjModel, body: int) -> list[int]:
     """Return a body and those that are fixed to it, such as the tool or the payload on a link."""
     return [body, *(b for b in range(body + 1, m.nbody) if m.body_weldid[b] == m.body_weldid[body])]
+
+
+def turning_axes(m: mujoco.MjModel, body: int) -> int:
+    """Return about how many axes a body turns against the world, by joints that are not parallel: from 0 to 3."""
+    data, axes, above = mujoco.MjData(m), [np.zeros(3)], int(body)
+    mujoco.mj_kinematics(m, data)
+    while above:
+        for j in range(m.body_jntadr[above], m.body_jntadr[above] + m.body_jntnum[above]):
+            if m.jnt_type[j] in (int(JOINT.mjJNT_FREE), int(JOINT.mjJNT_BALL)):
+                return 3
+            if m.jnt_type[j] == int(JOINT.mjJNT_HINGE):
+                axes.append(data.xaxis[j].copy())
+        above = int(m.body_parentid[above])
+    return int(np.linalg.matrix_rank(np.array(axes), tol=PARALLEL))
 
 
 def geoms_of(m: mujoco.MjModel, body: int) -> np.ndarray:

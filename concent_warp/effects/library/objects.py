@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links
+from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links, turning_axes
 
+AXES = "axes"
+"""Second target of an inertia with a factor for each principal axis."""
 LEVER_SHARE = 0.2
 """Share of its distance from the hinge that is taken for the size of a body that is small beside it, such as a bob [-]:
 its centre of mass may be off by three times as much, that of a rod by its own size."""
@@ -106,17 +110,44 @@ def _lever(m: mujoco.MjModel, body: int) -> float:
 
 
 class Inertia(BodyEffect):
-    """An inertia that is not the model's."""
+    """An inertia that is not the model's.
+
+    The target is a body, or a body and `AXES` where it turns about several axes, each of which has a factor of its own.
+    """
 
     name = "inertia"
-    summary = "The inertia is the model's times a factor; the mass stays."
+    summary = (
+        "The inertia is the model's times a factor; the mass stays. Or, with the second target axes: the moments about"
+        " the principal axes are, each by a factor of its own, named by the nearest axis of the body's frame."
+    )
     source = "rigid-body dynamics"
     signature = "residual torque in proportion to angular acceleration; spins and rebounds too fast or too slow"
     confusions = ("armature", "size", "center_of_mass")
+    requirement = "bodies that turn about several axes, where each has a factor of its own"
+
+    @property
+    def by_axis(self) -> bool:
+        """Whether each principal axis has a factor of its own."""
+        return len(self.target) > 1 and self.target[-1] == AXES
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The bodies."""
+        return self.target[:-1] if self.by_axis else self.target
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the bodies, and those that turn about several axes by axis, too."""
+        found = super().targets(m)
+        return (*found, *((n, AXES) for (n,) in found if cls(n, AXES).applies_to(m, m.body(n).id)))
+
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether a body turns about several axes where each has a factor of its own."""
+        return not self.by_axis or turning_axes(m, i) > 1
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return one factor."""
-        return (Parameter("inertia", "-", 1.0, 0.1, 10.0, 0.3),)
+        """Return one factor, or one for each axis."""
+        return tuple(Parameter(name, "-", 1.0, 0.1, 10.0, 0.3) for name in ("xyz" if self.by_axis else ("inertia",)))
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Inertia."""
@@ -124,7 +155,17 @@ class Inertia(BodyEffect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Scale it."""
-        m.body_inertia[self.ids(m)] *= values[0]
+        for b in self.ids(m):
+            m.body_inertia[b] *= values[_nearest_axes(m, b)] if self.by_axis else values[0]
+
+
+def _nearest_axes(m: mujoco.MjModel, body: int) -> np.ndarray:
+    """Return the axis of a body's frame that is nearest to each of its principal axes, none twice, shape (3,) int."""
+    principal = np.empty(9)
+    mujoco.mju_quat2Mat(principal, m.body_iquat[body])
+    towards = np.abs(principal.reshape(3, 3))
+    orders = [list(order) for order in permutations(range(3))]
+    return np.array(max(orders, key=lambda order: float(towards[order, range(3)].sum())))
 
 
 class Size(BodyEffect):
