@@ -10,8 +10,9 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links, turning_axes
 
-AXES = "axes"
-"""Second target of an inertia with a factor for each principal axis."""
+EACH_AXIS = "axes"
+AXES = ("axis_x", "axis_y", "axis_z", EACH_AXIS)
+"""Second targets of an inertia: the moment about one principal axis is off, or each is."""
 LEVER_SHARE = 0.2
 """Share of its distance from the hinge that is taken for the size of a body that is small beside it, such as a bob [-]:
 its centre of mass may be off by three times as much, that of a rod by its own size."""
@@ -112,42 +113,52 @@ def _lever(m: mujoco.MjModel, body: int) -> float:
 class Inertia(BodyEffect):
     """An inertia that is not the model's.
 
-    The target is a body, or a body and `AXES` where it turns about several axes, each of which has a factor of its own.
+    The target is a body, or, where it turns about several axes, a body and one of `AXES`: one moment alone is off, or
+    each has a factor of its own.
     """
 
     name = "inertia"
     summary = (
-        "The inertia is the model's times a factor; the mass stays. Or, with the second target axes: the moments about"
-        " the principal axes are, each by a factor of its own, named by the nearest axis of the body's frame."
+        "The inertia is the model's times a factor; the mass stays. Or, by a second target, one of"
+        f" {', '.join(AXES)}: the moment about one principal axis is, or each is by a factor of its own. Axes are named"
+        " by the nearest one of the body's frame."
     )
     source = "rigid-body dynamics"
     signature = "residual torque in proportion to angular acceleration; spins and rebounds too fast or too slow"
     confusions = ("armature", "size", "center_of_mass")
-    requirement = "bodies that turn about several axes, where each has a factor of its own"
+    requirement = "bodies that turn about several axes, where one moment of inertia is off"
 
     @property
-    def by_axis(self) -> bool:
-        """Whether each principal axis has a factor of its own."""
-        return len(self.target) > 1 and self.target[-1] == AXES
+    def part(self) -> str:
+        """The moments that are off, one of `AXES`; empty for all of them alike."""
+        return self.target[-1] if len(self.target) > 1 and self.target[-1] in AXES else ""
 
     @property
     def elements(self) -> tuple[str, ...]:
         """The bodies."""
-        return self.target[:-1] if self.by_axis else self.target
+        return self.target[:-1] if self.part else self.target
+
+    def has_as_special_case(self, other: Effect) -> bool:
+        """Return whether another inertia of the same bodies has one factor, where this one has three."""
+        mine = isinstance(other, Inertia) and other.elements == self.elements
+        return self.part == EACH_AXIS and mine and other.part != EACH_AXIS
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return the bodies, and those that turn about several axes by axis, too."""
+        """Return the bodies; those that turn about several axes also with each of `AXES`."""
         found = super().targets(m)
-        return (*found, *((n, AXES) for (n,) in found if cls(n, AXES).applies_to(m, m.body(n).id)))
+        several = [n for (n,) in found if turning_axes(m, m.body(n).id) > 1]
+        return (*found, *((n, part) for n in several for part in AXES))
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether a body turns about several axes where each has a factor of its own."""
-        return not self.by_axis or turning_axes(m, i) > 1
+        """Return whether a body turns about several axes, where one moment is off."""
+        return not self.part or turning_axes(m, i) > 1
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor, or one for each axis."""
-        return tuple(Parameter(name, "-", 1.0, 0.1, 10.0, 0.3) for name in ("xyz" if self.by_axis else ("inertia",)))
+        names = "xyz" if self.part == EACH_AXIS else (self.part[-1:] or self.name,)
+        scan = (0.7, 1.4) if self.part else ()
+        return tuple(Parameter(name, "-", 1.0, 0.1, 10.0, 0.3, scan=scan) for name in names)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Inertia."""
@@ -155,8 +166,11 @@ class Inertia(BodyEffect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Scale it."""
+        changed = np.array([self.part in ("", EACH_AXIS, axis) for axis in AXES[:3]])
+        factors = np.ones(3)
+        factors[changed] = values
         for b in self.ids(m):
-            m.body_inertia[b] *= values[_nearest_axes(m, b)] if self.by_axis else values[0]
+            m.body_inertia[b] *= factors[_nearest_axes(m, b)]
 
 
 def _nearest_axes(m: mujoco.MjModel, body: int) -> np.ndarray:
