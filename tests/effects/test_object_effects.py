@@ -101,6 +101,10 @@ def test_moments_of_inertia_are_candidates_by_axis_of_bodies_that_turn_about_sev
     assert Inertia.targets(mujoco.MjModel.from_xml_string(gimbal.format(axis="0 0 1"))) == (("inner",),)
     assert Inertia.targets(mujoco.MjModel.from_xml_string(BALL)) == (("thing",), *(("thing", part) for part in AXES))
     effect = Inertia("thing", "axes")
+    assert all(effect.has_as_special_case(Inertia("thing", *part)) for part in ((), ("axis_x",)))
+    assert not effect.has_as_special_case(effect)
+    assert not effect.has_as_special_case(Inertia("other"))
+    assert not Inertia("thing", "axis_x").has_as_special_case(Inertia("thing"))
     assert effect.is_part
     assert effect.elements == ("thing",)
     with pytest.raises(ModelError, match="several axes"):

@@ -124,8 +124,7 @@ def test_an_impact_shows_in_the_scatter_also_where_the_readings_on_one_side_are_
     scatter = StateEstimator.of(Model(Scene(SCENE)), demonstration).scatter(
         np.concatenate([near, np.linspace(0.2, 0.9, 40)])
     )
-    assert (scatter[: len(near)] > 3).all()
-    assert (scatter[len(near) :] < 2).all()
+    assert scatter[: len(near)].min() > max(3.0, scatter[len(near) :].max())
 
 
 def test_angular_motion_of_a_quaternion_agrees_with_finite_differences():
