@@ -140,8 +140,9 @@ class Inertia(BodyEffect):
 
     def has_as_special_case(self, other: Effect) -> bool:
         """Return whether another inertia of the same bodies has one factor, where this one has three."""
-        mine = isinstance(other, Inertia) and other.elements == self.elements
-        return self.part == EACH_AXIS and mine and other.part != EACH_AXIS
+        if not isinstance(other, Inertia) or other.elements != self.elements:
+            return False
+        return self.part == EACH_AXIS != other.part
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
