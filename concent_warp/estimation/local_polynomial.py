@@ -129,7 +129,7 @@ class LocalPolynomial:
     @property
     def std(self) -> float:
         """Noise of a component: the median scatter of the readings about their polynomials."""
-        return float(np.median([fit.scatter for fit in self.fits(self.time)]))
+        return float(np.median(self.scatter(self.time)))
 
     def fits(self, time: np.ndarray) -> list[LocalFit]:
         """Return the polynomials about each of `time` (T,) [s]."""
@@ -145,9 +145,13 @@ class LocalPolynomial:
         return _with_rate_sensor(self.fits(time), self.velocity, time)
 
     def scatter(self, time: np.ndarray) -> np.ndarray:
-        """Return the root mean square distance of the readings around each time from one polynomial, shape (T,).
+        """Return the root mean square distance of the readings around each time from their polynomial, shape (T,)."""
+        return np.array([fit.scatter for fit in self.fits(time)])
 
-        They are those on both sides: it is large where an impact lies among them, though one side may be smooth.
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same of the polynomial through the readings on both sides, shape (T,).
+
+        It is large where an impact lies among them, though one side may be smooth.
         """
         return np.array([self._around(float(now)).scatter for now in time])
 
@@ -199,7 +203,7 @@ class LocalPolynomialOrientation:
     @property
     def std(self) -> float:
         """Noise of a component of the rotation vector [rad]: the median scatter of the readings."""
-        return float(np.median([fit.scatter for fit in self.fits(self.time)]))
+        return float(np.median(self.scatter(self.time)))
 
     def fits(self, time: np.ndarray) -> list[LocalFit]:
         """Return the polynomials of the rotation vector [rad] about each of `time` (T,) [s]."""
@@ -224,9 +228,13 @@ class LocalPolynomialOrientation:
         return _with_rate_sensor(self.fits(time), self.velocity, time)
 
     def scatter(self, time: np.ndarray) -> np.ndarray:
-        """Return the root mean square distance of the readings around each time from one polynomial [rad], (T,).
+        """Return the root mean square distance of the readings around each time from their polynomial [rad], (T,)."""
+        return np.array([fit.scatter for fit in self.fits(time)])
 
-        They are those on both sides: it is large where an impact lies among them, though one side may be smooth.
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same of the polynomial through the readings on both sides [rad], (T,).
+
+        It is large where an impact lies among them, though one side may be smooth.
         """
         return np.array([self._fits_about(float(now))[0].scatter for now in time])
 
