@@ -43,6 +43,7 @@ from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
+from concent_warp.fit.effects.impacts import flying_bodies
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import channel_noises, has_touchable_free_body, observe
 from concent_warp.fit.effects.prediction import Prediction
@@ -208,8 +209,8 @@ class Procedure:
         """
         cfg = self.context.cfg
         observation = replace(cfg.fits.observation, impact_error=cfg.search.impact_error)
-        free = has_touchable_free_body(self.model.compile())
-        if not (observation.impact_error and free) or len(fitted[-1].windows) != len(given.windows):
+        flies = bool(flying_bodies(self.model.compile()))
+        if not (observation.impact_error and flies) or len(fitted[-1].windows) != len(given.windows):
             return None
         followed = self._followed(given, fitted[-1])
         if given.noise_ratio > cfg.search.far_ratio and all(one is given for one in followed):

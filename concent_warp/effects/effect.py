@@ -192,6 +192,10 @@ class Effect:
         """Return the true state of which the instruments show `qpos` (nq,) and `qvel` (nv,), apart from `true_time`."""
         return qpos, qvel
 
+    def has_as_special_case(self, other: Effect) -> bool:
+        """Return whether another effect of fewer parameters equals this one at some of its values."""
+        return other.name in self.special_cases
+
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the joints, actuators, bodies, geoms or sensors among the target; all of it, by default."""

@@ -14,6 +14,8 @@ SENSOR = mujoco.mjtSensor
 SINGLE = (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_SLIDE))
 BEARINGS = (*SINGLE, int(JOINT.mjJNT_BALL))
 POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
+PARALLEL = 1e-3
+"""Part of an axis across others below which they are parallel [-]."""
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
 
 
@@ -123,6 +125,20 @@ def moving_as_one(m: mujoco.MjModel, body: int) -> list[int]:
     return [body, *(b for b in range(body + 1, m.nbody) if m.body_weldid[b] == m.body_weldid[body])]
 
 
+def turning_axes(m: mujoco.MjModel, body: int) -> int:
+    """Return about how many axes a body turns against the world, by joints that are not parallel: from 0 to 3."""
+    data, axes, above = mujoco.MjData(m), [np.zeros(3)], int(body)
+    mujoco.mj_kinematics(m, data)
+    while above:
+        for j in range(m.body_jntadr[above], m.body_jntadr[above] + m.body_jntnum[above]):
+            if m.jnt_type[j] in (int(JOINT.mjJNT_FREE), int(JOINT.mjJNT_BALL)):
+                return 3
+            if m.jnt_type[j] == int(JOINT.mjJNT_HINGE):
+                axes.append(data.xaxis[j].copy())
+        above = int(m.body_parentid[above])
+    return int(np.linalg.matrix_rank(np.array(axes), tol=PARALLEL))
+
+
 def geoms_of(m: mujoco.MjModel, body: int) -> np.ndarray:
     """Return the geoms that move as one with a body, shape (n,) int."""
     return np.flatnonzero(m.body_weldid[m.geom_bodyid] == m.body_weldid[body])
@@ -137,6 +153,42 @@ def surfaces(m: mujoco.MjModel, body: int) -> np.ndarray:
     """Return the colliding geoms of a body and all static colliding geoms, shape (n,) int."""
     ids = np.union1d(geoms_of(m, body), static_geoms(m))
     return ids[(m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)]
+
+
+def touchable_pairs(m: mujoco.MjModel) -> np.ndarray:
+    """Return which geoms MuJoCo lets touch, by their masks and bodies, shape (ngeom, ngeom) bool, symmetric."""
+    kind, affinity = m.geom_contype, m.geom_conaffinity
+    masks = (kind[:, None] & affinity[None]) | (affinity[:, None] & kind[None])
+    weld = m.body_weldid[m.geom_bodyid]
+    found = (masks != 0) & (weld[:, None] != weld[None])
+    if not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        above = m.body_weldid[m.body_parentid[weld]]
+        carried = (above[:, None] == weld[None]) & (above[:, None] != 0)
+        found &= ~(carried | carried.T)
+    for signature in m.exclude_signature:
+        one, other = m.geom_bodyid == int(signature) >> 16, m.geom_bodyid == int(signature) & 0xFFFF
+        found &= ~(one[:, None] & other[None] | other[:, None] & one[None])
+    return found
+
+
+def jointed_contact_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+    """Return selections of bodies on joints that can touch one another, or what stands still: a finger and a door.
+
+    Bodies that can touch the same are one selection. There is none where a body moves freely: what it touches, and what
+    stands still, is that of its own contacts.
+    """
+    if free_bodies(m):
+        return ()
+    touching, body = touchable_pairs(m), m.body_weldid[m.geom_bodyid]
+    group = np.arange(m.nbody)
+    for one, other in np.unique(body[np.argwhere(touching)], axis=0):
+        group[group == group[other]] = group[one]
+    moving = [b for b in np.unique(body[touching.any(axis=0)]) if b]
+    found = (
+        tuple(n for b in moving if group[b] == g and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        for g in dict.fromkeys(int(group[b]) for b in moving)
+    )
+    return tuple(names for names in found if names)
 
 
 def sensors_by_type(m: mujoco.MjModel, kinds: tuple[int, ...]) -> tuple[str, ...]:

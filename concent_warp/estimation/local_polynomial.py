@@ -148,9 +148,16 @@ class LocalPolynomial:
         """Return the root mean square distance of the readings around each time from their polynomial, shape (T,)."""
         return np.array([fit.scatter for fit in self.fits(time)])
 
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same of the polynomial through the readings on both sides, shape (T,).
+
+        It is large where an impact lies among them, though one side may be smooth.
+        """
+        return np.array([self._around(float(now)).scatter for now in time])
+
     def acceleration(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the second derivative from readings on both sides of each time (T, n), its standard error (T,)."""
-        fits = [self._local_fit(_neighbourhoods(self.cfg, self.time, float(t), self.degree)[0], float(t)) for t in time]
+        fits = [self._around(float(now)) for now in time]
         return np.array([fit.derivatives[2] for fit in fits]), np.array([fit.errors[2] for fit in fits])
 
     def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
@@ -166,6 +173,10 @@ class LocalPolynomial:
             self.cfg,
             [self._local_fit(rows, now) for rows in _neighbourhoods(self.cfg, self.time, now, self.degree)],
         )
+
+    def _around(self, now: float) -> LocalFit:
+        """Return the polynomial through the readings on both sides of a time."""
+        return self._local_fit(_neighbourhoods(self.cfg, self.time, now, self.degree)[0], now)
 
     def _local_fit(self, rows: slice, now: float) -> LocalFit:
         """Return the polynomial through some readings."""
@@ -220,6 +231,13 @@ class LocalPolynomialOrientation:
         """Return the root mean square distance of the readings around each time from their polynomial [rad], (T,)."""
         return np.array([fit.scatter for fit in self.fits(time)])
 
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same of the polynomial through the readings on both sides [rad], (T,).
+
+        It is large where an impact lies among them, though one side may be smooth.
+        """
+        return np.array([self._fits_about(float(now))[0].scatter for now in time])
+
     def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
         """Return quaternion (1 + count, T, 4) and angular velocity (1 + count, T, 3) at `time` (T,), then samples."""
         found = self.estimate(time)
@@ -236,14 +254,15 @@ class LocalPolynomialOrientation:
 
     def _fit(self, now: float) -> LocalFit:
         """Return the polynomial about a time."""
+        return _best_fit(self.cfg, self._fits_about(now))
+
+    def _fits_about(self, now: float) -> list[LocalFit]:
+        """Return the polynomials through the readings on both sides of a time, and on either."""
         middle = self._nearest(now).inv()
-        return _best_fit(
-            self.cfg,
-            [
-                _local_fit(self.time[rows] - now, (middle * self.rotation[rows.start : rows.stop]).as_rotvec(), 2)
-                for rows in _neighbourhoods(self.cfg, self.time, now, 2)
-            ],
-        )
+        return [
+            _local_fit(self.time[rows] - now, (middle * self.rotation[rows.start : rows.stop]).as_rotvec(), 2)
+            for rows in _neighbourhoods(self.cfg, self.time, now, 2)
+        ]
 
 
 def _with_rate_sensor(fits: Sequence[LocalFit], velocity: LocalPolynomial | None, time: np.ndarray) -> np.ndarray:

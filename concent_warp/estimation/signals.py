@@ -65,6 +65,10 @@ class _SmoothedReadings(Readings, Protocol):
         """Return the root mean square distance of the readings around each time from the estimate, shape (T,)."""
         ...
 
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same, never of the readings on one side of each time alone, shape (T,)."""
+        ...
+
 
 class Signal(_SmoothedReadings, Protocol):
     """A quantity with n components that can be averaged, such as a position."""

@@ -180,6 +180,10 @@ class SplineSignal:
         """Return the root mean square distance of the readings around each time from the spline, shape (T,)."""
         return self.spline.scatter(time, self.time, self.value)
 
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same: the readings are those on both sides, shape (T,)."""
+        return self.scatter(time)
+
     def acceleration(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the second derivative at `time` (T,) and its standard error, shapes (T, n) and (T,)."""
         return self.spline.at(time, 2), np.sqrt(self.spline.covariance(time)[:, 2, 2])
@@ -214,6 +218,10 @@ class SplineOrientation:
     def scatter(self, time: np.ndarray) -> np.ndarray:
         """Return the root mean square distance of the readings around each time from the spline [rad], shape (T,)."""
         return 2 * self.spline.scatter(time, self.time, self.value)
+
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same: the readings are those on both sides, shape (T,)."""
+        return self.scatter(time)
 
     def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
         """Return quaternion (1 + count, T, 4) and angular velocity (1 + count, T, 3) at `time` (T,), then samples."""

@@ -224,12 +224,18 @@ class StateEstimator:
                 qvel[:, :, body.dof + 3 : body.dof + 6] = spin
         return qpos, qvel
 
-    def scatter(self, time: np.ndarray) -> np.ndarray:
+    def scatter(self, time: np.ndarray, *, both_sides: bool = False) -> np.ndarray:
         """Return the scatter of the readings around each of `time` (T,), over the median, of the worst signal, (T,).
 
         Large where an impact lies among the readings.
+
+        Args:
+            time: Shape (T,) [s].
+            both_sides: Whether readings on both sides of each time count also where those on one side, which may be
+                smooth up to an impact, are what an estimate is taken from.
         """
-        scatter = np.array([signal.scatter(time) for signal in self.signals()])
+        signals = self.signals()
+        scatter = np.array([s.scatter_of_both_sides(time) if both_sides else s.scatter(time) for s in signals])
         return (scatter / np.maximum(np.median(scatter, axis=1, keepdims=True), 1e-12)).max(axis=0)
 
     def in_contact(self, bodies: Sequence[str], time: np.ndarray) -> np.ndarray:

@@ -1,9 +1,13 @@
+from copy import copy
+
 import mujoco
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from small_worlds import BALL, BLOCK, FLOOR, MOTOR, PENDULUM, SLIDER, G, move, world
 
-from concent_warp.effects.library.objects import CenterOfMass, Inertia, Mass, Size
+from concent_warp.effects.library.objects import AXES, CenterOfMass, Inertia, Mass, Size
+from concent_warp.errors import ModelError
 
 CART = SLIDER.format(joint="", actuator=MOTOR)
 
@@ -56,6 +60,65 @@ def test_pendulum_of_another_inertia_swings_with_another_period(factor):
     falls = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))
     period = np.diff(falls)[0] * 0.001
     assert period == pytest.approx(2 * np.pi * np.sqrt((0.004 * factor + 0.5 * 0.2**2) / (0.5 * G * 0.2)), abs=0.002)
+
+
+SPINNING = """
+<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody><body name="thing" pos="0 0 1"><freejoint/>
+  <inertial pos="0 0 0" mass="0.4" diaginertia="4e-4 9e-4 12e-4" {turned}/>
+  <geom size="0.05" contype="0" conaffinity="0" mass="0"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("turned", ["", 'quat="0.5 0.5 0.5 0.5"', 'quat="0.7 0.1 0.05 0.7"'])
+def test_each_principal_axis_has_its_moment_named_by_the_nearest_axis_of_the_body(turned):
+    m = mujoco.MjModel.from_xml_string(SPINNING.format(turned=turned))
+    effect = Inertia("thing", "axes")
+    assert [p.name for p in effect.parameters(m)] == ["x", "y", "z"]
+    before, after = full_inertia(m), copy(m)
+    effect.write(after, np.array([1.0, 1.5, 1.0]))
+    nearest = np.argmax(np.abs(principal_axes(m)), axis=0)
+    np.testing.assert_allclose(after.body_inertia[1], m.body_inertia[1] * np.where(nearest == 1, 1.5, 1.0))
+    effect.write(m, np.full(3, 2.0))
+    np.testing.assert_allclose(full_inertia(m), 2 * before)
+
+
+def principal_axes(m):
+    """Return the principal axes of the body in its frame, one a column."""
+    found = np.empty(9)
+    mujoco.mju_quat2Mat(found, m.body_iquat[1])
+    return found.reshape(3, 3)
+
+
+def full_inertia(m):
+    """Return the inertia of the body in its frame."""
+    return principal_axes(m) @ np.diag(m.body_inertia[1]) @ principal_axes(m).T
+
+
+def test_moments_of_inertia_are_candidates_by_axis_of_bodies_that_turn_about_several_axes():
+    gimbal = """<mujoco><worldbody><body name="outer"><joint axis="0 0 1"/><geom size="0.1"/>
+      <body name="inner"><joint axis="{axis}"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
+    several = mujoco.MjModel.from_xml_string(gimbal.format(axis="0 1 0"))
+    assert Inertia.targets(several) == (("inner",), *(("inner", part) for part in AXES))
+    assert Inertia.targets(mujoco.MjModel.from_xml_string(gimbal.format(axis="0 0 1"))) == (("inner",),)
+    assert Inertia.targets(mujoco.MjModel.from_xml_string(BALL)) == (("thing",), *(("thing", part) for part in AXES))
+    effect = Inertia("thing", "axes")
+    assert all(effect.has_as_special_case(Inertia("thing", *part)) for part in ((), ("axis_x",)))
+    assert not effect.has_as_special_case(effect)
+    assert not effect.has_as_special_case(Inertia("other"))
+    assert not Inertia("thing", "axis_x").has_as_special_case(Inertia("thing"))
+    assert effect.is_part
+    assert effect.elements == ("thing",)
+    with pytest.raises(ModelError, match="several axes"):
+        world(PENDULUM, Inertia("link", "axes"))
+
+
+@pytest.mark.parametrize(("part", "factors"), [(("axes",), (1.5, 1.0, 1.0)), (("axis_x",), (1.5,))])
+def test_a_body_with_one_moment_off_spins_as_eulers_equations_say(part, factors):
+    moments = np.array([6e-4, 9e-4, 12e-4])
+    body = world(SPINNING.format(turned=""), Inertia("thing", *part), *factors)
+    spin = np.array([2.0, 5.0, -1.0])
+    found = move(body, 1.0, qpos=[0, 0, 1, 1, 0, 0, 0], qvel=[0, 0, 0, *spin])
+    euler = solve_ivp(lambda _, w: np.cross(moments * w, w) / moments, (0, 1), spin, rtol=1e-9)
+    np.testing.assert_allclose(found.qvel[-1, 3:], euler.y[:, -1], atol=0.02)
 
 
 @pytest.mark.parametrize(("shape", "size", "half"), [("box", "0.05 0.04 0.02", 0.02), ("sphere", "0.05", 0.05)])

@@ -116,6 +116,16 @@ def test_a_jump_shows_in_the_scatter_of_the_readings_about_a_spline():
     assert scatter.max() > 3 * np.median(scatter)
 
 
+def test_an_impact_shows_in_the_scatter_also_where_the_readings_on_one_side_are_smooth():
+    demonstration = recorded(0)
+    time = demonstration.measured["position"].time
+    demonstration.measured["position"].value[:] += 2.0 * np.maximum(time - 1.0, 0.0)[:, None]
+    near = np.array([0.995, 1.0, 1.005, 1.015])
+    measured, times = StateEstimator.of(Model(Scene(SCENE)), demonstration), np.linspace(0.2, 0.9, 40)
+    scatter = measured.scatter(np.concatenate([near, times]), both_sides=True)
+    assert scatter[: len(near)].min() > max(3.0, scatter[len(near) :].max())
+
+
 def test_angular_motion_of_a_quaternion_agrees_with_finite_differences():
     def at(t: float) -> np.ndarray:
         turn = Rotation.from_rotvec([0.3 * t**2, 0.5 * t, -0.2 * t**3]) * Rotation.from_rotvec([0, t**2, 0])

@@ -146,7 +146,7 @@ def indistinguishable(
         if rarer or _leaves_as_little(c, best, cfg, slack):
             group.append((c, f))
     ranked = sorted(((_plausibility(base, *pair), pair) for pair in group), key=lambda found: -found[0])
-    (first, _), names = ranked[0][1], {c.effect.name for c, _ in group}
+    first, _ = ranked[0][1]
     return [
         (c, f)
         for place, (score, (c, f)) in enumerate(ranked)
@@ -154,7 +154,7 @@ def indistinguishable(
         or (
             score > ranked[0][0] - 2 * np.log(cfg.max_odds)
             and any(_leaves_as_little(c, other, cfg, slack) for other in (best, first))
-            and not names & set(c.effect.special_cases)
+            and not any(c.effect.has_as_special_case(other.effect) for other, _ in group)
         )
     ]
 

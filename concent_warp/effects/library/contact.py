@@ -18,6 +18,7 @@ from concent_warp.effects.select import (
     free_bodies,
     free_body_targets,
     geoms_of,
+    jointed_contact_targets,
     surfaces,
 )
 
@@ -34,11 +35,13 @@ TURNING = "Coulomb friction: a torque beside MuJoCo's contacts where the model h
 
 
 class SurfaceEffect(Effect):
-    """An effect on contacts between a free body and static geoms."""
+    """An effect on contacts between bodies and static geoms, or between several bodies."""
 
     family = "contact"
     kind = "body"
     requirement = "bodies with geoms that collide"
+    of_joints: ClassVar[bool] = False
+    """Whether bodies on joints, such as a finger and the door that it presses on, may lack it too."""
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the body collides."""
@@ -46,8 +49,9 @@ class SurfaceEffect(Effect):
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body that collides."""
-        return tuple(t for t in free_body_targets(m) if all(_collides(m, m.body(n).id) for n in t))
+        """Return each free body that collides, and bodies on joints that can touch one another."""
+        found = (*free_body_targets(m), *(jointed_contact_targets(m) if cls.of_joints else ()))
+        return tuple(t for t in found if all(cls(*t).applies_to(m, m.body(n).id) for n in t))
 
     def geoms(self, m: mujoco.MjModel) -> np.ndarray:
         """Return the geoms of the target and of all that stands still, shape (n,) int."""
@@ -213,16 +217,12 @@ class ContactCompliance(SurfaceEffect):
     signature = "height of rebounds; sinking in at rest and at impacts"
     confusions = ("size", "adhesion", "air_drag")
     null_error = 0.025  # rebounds of one ball from one floor scatter by 2 to 3 %
+    of_joints = True
     requirement = "bodies that collide, in contacts that are damped"
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether its contacts are damped."""
         return super().applies_to(m, i) and bool(np.isfinite(_mean_solref(m, np.array([i]))).all())
-
-    @classmethod
-    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body whose contacts are damped."""
-        return tuple(t for t in free_body_targets(m) if cls(*t).applies_to(m, m.body(t[0]).id))
 
     def mean(self, m: mujoco.MjModel) -> np.ndarray:
         """Return time constant [s] and damping ratio of body and surroundings, as they act together, shape (2,)."""

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links
+from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links, turning_axes
 
+EACH_AXIS = "axes"
+AXES = ("axis_x", "axis_y", "axis_z", EACH_AXIS)
+"""Second targets of an inertia: the moment about one principal axis is off, or each is."""
 LEVER_SHARE = 0.2
 """Share of its distance from the hinge that is taken for the size of a body that is small beside it, such as a bob [-]:
 its centre of mass may be off by three times as much, that of a rod by its own size."""
@@ -106,17 +111,55 @@ def _lever(m: mujoco.MjModel, body: int) -> float:
 
 
 class Inertia(BodyEffect):
-    """An inertia that is not the model's."""
+    """An inertia that is not the model's.
+
+    The target is a body, or, where it turns about several axes, a body and one of `AXES`: one moment alone is off, or
+    each has a factor of its own.
+    """
 
     name = "inertia"
-    summary = "The inertia is the model's times a factor; the mass stays."
+    summary = (
+        "The inertia is the model's times a factor; the mass stays. Or, by a second target, one of"
+        f" {', '.join(AXES)}: the moment about one principal axis is, or each is by a factor of its own. Axes are named"
+        " by the nearest one of the body's frame."
+    )
     source = "rigid-body dynamics"
     signature = "residual torque in proportion to angular acceleration; spins and rebounds too fast or too slow"
     confusions = ("armature", "size", "center_of_mass")
+    requirement = "bodies that turn about several axes, where one moment of inertia is off"
+
+    @property
+    def part(self) -> str:
+        """The moments that are off, one of `AXES`; empty for all of them alike."""
+        return self.target[-1] if len(self.target) > 1 and self.target[-1] in AXES else ""
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The bodies."""
+        return self.target[:-1] if self.part else self.target
+
+    def has_as_special_case(self, other: Effect) -> bool:
+        """Return whether another inertia of the same bodies has one factor, where this one has three."""
+        if not isinstance(other, Inertia) or other.elements != self.elements:
+            return False
+        return self.part == EACH_AXIS != other.part
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the bodies; those that turn about several axes also with each of `AXES`."""
+        found = super().targets(m)
+        several = [n for (n,) in found if turning_axes(m, m.body(n).id) > 1]
+        return (*found, *((n, part) for n in several for part in AXES))
+
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether a body turns about several axes, where one moment is off."""
+        return not self.part or turning_axes(m, i) > 1
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return one factor."""
-        return (Parameter("inertia", "-", 1.0, 0.1, 10.0, 0.3),)
+        """Return one factor, or one for each axis."""
+        names = "xyz" if self.part == EACH_AXIS else (self.part[-1:] or self.name,)
+        scan = (0.7, 1.4) if self.part else ()
+        return tuple(Parameter(name, "-", 1.0, 0.1, 10.0, 0.3, scan=scan) for name in names)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Inertia."""
@@ -124,7 +167,20 @@ class Inertia(BodyEffect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Scale it."""
-        m.body_inertia[self.ids(m)] *= values[0]
+        changed = np.array([self.part in ("", EACH_AXIS, axis) for axis in AXES[:3]])
+        factors = np.ones(3)
+        factors[changed] = values
+        for b in self.ids(m):
+            m.body_inertia[b] *= factors[_nearest_axes(m, b)]
+
+
+def _nearest_axes(m: mujoco.MjModel, body: int) -> np.ndarray:
+    """Return the axis of a body's frame that is nearest to each of its principal axes, none twice, shape (3,) int."""
+    principal = np.empty(9)
+    mujoco.mju_quat2Mat(principal, m.body_iquat[body])
+    towards = np.abs(principal.reshape(3, 3))
+    orders = [list(order) for order in permutations(range(3))]
+    return np.array(max(orders, key=lambda order: float(towards[order, range(3)].sum())))
 
 
 class Size(BodyEffect):

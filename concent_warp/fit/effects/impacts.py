@@ -20,8 +20,30 @@ from concent_warp.fit.effects.prediction import Course, Prediction, Reader, Simu
 
 
 @dataclass(frozen=True)
+class FlyingBody:
+    """A body that may fly: a free one, or one that slides along axes that stand still."""
+
+    body: int
+    dof: int
+    """Its first degree of freedom."""
+    axes: np.ndarray
+    """Directions in which it slides, world frame, shape (k, 3) with k from 1 to 3; of a free body the world's."""
+    turns: bool
+    """Whether it is free, and turns too."""
+
+    @property
+    def count(self) -> int:
+        """Degrees of freedom."""
+        return len(self.axes) + 3 * self.turns
+
+    def along_axes(self, vector: np.ndarray) -> np.ndarray:
+        """Return what of a vector (3,) lies in the space in which it moves."""
+        return np.linalg.pinv(self.axes) @ self.axes @ vector
+
+
+@dataclass(frozen=True)
 class Impact:
-    """An impact of a free body that flew before."""
+    """An impact of a body that flew before."""
 
     begin: int
     """Step of the simulation before it."""
@@ -30,7 +52,8 @@ class Impact:
     dof: int
     """First degree of freedom of the body."""
     std: np.ndarray
-    """Standard deviation of the velocities after it that no law foretells, linear [m/s] and angular [rad/s], (6,)."""
+    """Standard deviation of the velocities after it that no law foretells, linear [m/s] and angular [rad/s], (6,) of a
+    free body, (k,) of one with k slides."""
     flies: bool
     """Whether the body flies after it, and does not stay in contact."""
 
@@ -56,8 +79,9 @@ def impact_deviations(
     (course,) = prediction.courses([SimulationRequest(window, values, begun)])
     columns = []
     for impact in impacts(m, course, cfg):
-        offsets = np.zeros((7, 2 * m.nv))
-        offsets[1:, m.nv + impact.dof : m.nv + impact.dof + 6] = np.diag(impact.std)
+        count = len(impact.std)
+        offsets = np.zeros((1 + count, 2 * m.nv))
+        offsets[1:, m.nv + impact.dof : m.nv + impact.dof + count] = np.diag(impact.std)
 
         def continued(at: int, changes: np.ndarray, impact: Impact = impact) -> list[np.ndarray]:
             """Return the residuals where the motion goes on with the velocity after the impact, from some step on."""
@@ -79,29 +103,46 @@ def impact_deviations(
     return np.stack(kept, axis=1) if kept else none
 
 
-def impacts(m: mujoco.MjModel, course: Course, cfg: ObservationCfg) -> Iterator[Impact]:
-    """Yield the impacts of free bodies in a simulated motion, those in which they change their velocity notably.
+def flying_bodies(m: mujoco.MjModel) -> list[FlyingBody]:
+    """Return the bodies that may fly: free ones with a mass, and those that slide against what stands still.
 
-    A body flies where its centre of mass accelerates as gravity does.
+    The mass of a free one without may be in bodies that are fixed to it.
+    """
+    data, found = mujoco.MjData(m), []
+    mujoco.mj_kinematics(m, data)
+    for body in range(1, m.nbody):
+        first, count = int(m.body_jntadr[body]), int(m.body_jntnum[body])
+        joints = slice(first, first + count)
+        kinds = set(m.jnt_type[joints].tolist())
+        if m.body_weldid[m.body_parentid[body]] or m.body_mass[body] <= 0:
+            continue
+        if kinds == {int(mujoco.mjtJoint.mjJNT_FREE)}:
+            found.append(FlyingBody(body, int(m.jnt_dofadr[first]), np.eye(3), turns=True))
+        elif kinds == {int(mujoco.mjtJoint.mjJNT_SLIDE)}:
+            found.append(FlyingBody(body, int(m.jnt_dofadr[first]), data.xaxis[joints].copy(), turns=False))
+    return found
+
+
+def impacts(m: mujoco.MjModel, course: Course, cfg: ObservationCfg) -> Iterator[Impact]:
+    """Yield the impacts of bodies that fly in a simulated motion, those in which they change their velocity notably.
+
+    A body flies where its centre of mass accelerates as gravity does, along the axes of its slides if it has any.
 
     Args:
         m: The compiled model.
         course: The motion, at each step.
         cfg: Settings.
     """
-    step, gravity = m.opt.timestep, np.array(m.opt.gravity)
+    step, least = m.opt.timestep, max(float(np.linalg.norm(m.opt.gravity)), 1.0)
     if not np.isfinite(course.qpos).all() or not np.isfinite(course.qvel).all():
         return
     flown, lasting = (max(round(t / step), 1) for t in (cfg.impact_flight, cfg.impact_duration))
-    for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
-        body, dof = int(m.jnt_bodyid[joint]), int(m.jnt_dofadr[joint])
-        if m.body_mass[body] <= 0:  # its mass is in bodies that are fixed to it
-            continue
-        velocity = _center_velocity(m, body, course.qpos[:, m.jnt_qposadr[joint] + 3 :], course.qvel[:, dof : dof + 6])
-        turning = course.qvel[:, dof + 3 : dof + 6]
+    for flying in flying_bodies(m):
+        velocity, turning = _velocity(m, flying, course)
+        gravity = flying.along_axes(np.array(m.opt.gravity))
         pushed = np.linalg.norm(np.diff(velocity, axis=0) / step - gravity, axis=1)
-        touching = pushed > cfg.impact_acceleration * max(float(np.linalg.norm(gravity)), 1.0)
-        radius = np.sqrt(m.body_inertia[body] / m.body_mass[body])
+        touching = pushed > cfg.impact_acceleration * least
+        radius = np.sqrt(m.body_inertia[flying.body] / m.body_mass[flying.body])
         for begin in np.flatnonzero(touching[1:] & ~touching[:-1]) + 1:
             if begin < flown or touching[begin - flown : begin].any():
                 continue
@@ -111,9 +152,18 @@ def impacts(m: mujoco.MjModel, course: Course, cfg: ObservationCfg) -> Iterator[
             turned = np.linalg.norm(turning[end] - turning[begin])
             if change < cfg.impact_velocity or end >= len(touching):
                 continue
-            linear, angular = np.full(3, change), np.hypot(turned, change / np.maximum(radius, 1e-9))
-            std = cfg.impact_error * np.concatenate([linear, angular])
-            yield Impact(int(begin) - 1, int(end), dof, std, bool(len(flight)))
+            linear, angular = np.full(len(flying.axes), change), np.hypot(turned, change / np.maximum(radius, 1e-9))
+            std = cfg.impact_error * np.concatenate([linear, angular])[: flying.count]
+            yield Impact(int(begin) - 1, int(end), flying.dof, std, bool(len(flight)))
+
+
+def _velocity(m: mujoco.MjModel, flying: FlyingBody, course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """Return the velocity of a body's centre of mass, world frame, and its angular velocity, shape (T, 3) each."""
+    qvel = course.qvel[:, flying.dof : flying.dof + flying.count]
+    if not flying.turns:
+        return qvel @ flying.axes, np.zeros((len(qvel), 3))
+    first = int(m.jnt_qposadr[m.body_jntadr[flying.body]])
+    return _center_velocity(m, flying.body, course.qpos[:, first + 3 :], qvel), qvel[:, 3:]
 
 
 def _center_velocity(m: mujoco.MjModel, body: int, orientation: np.ndarray, qvel: np.ndarray) -> np.ndarray:

@@ -215,6 +215,6 @@ def _rms(value: np.ndarray) -> np.ndarray:
 def _calmest(measured: StateEstimator, start: float, reach: float, cfg: ObservationCfg) -> float:
     """Return the time at which a window ends [s]: late, and not in an impact, where velocities are unknown."""
     times = start + np.linspace(reach, 0.35 * reach, 27)
-    rough = measured.scatter(times)
+    rough = measured.scatter(times, both_sides=True)
     calm = np.flatnonzero(rough < cfg.max_scatter)
     return float(times[calm[0] if len(calm) else rough.argmin()])

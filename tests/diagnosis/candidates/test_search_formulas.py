@@ -185,7 +185,9 @@ def test_scanned_values_beyond_one_that_is_far_worse_are_not_tried(monkeypatch):
 def fitted(errors: np.ndarray, **changes: Any) -> Any:
     """Return a fitted candidate with held-out errors."""
     rarity = changes.pop("rarity", 0.0)
-    effect = SimpleNamespace(rarity=rarity, special_cases=(), name="mass", target=("x",), family="objects")
+    effect = SimpleNamespace(
+        rarity=rarity, has_as_special_case=lambda _: False, name="mass", target=("x",), family="objects"
+    )
     values = np.array([0.3, 1.7, -0.2, 5.0])
     base = FittedCandidate(
         cast("Any", effect),

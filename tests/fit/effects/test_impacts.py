@@ -1,12 +1,13 @@
 """Impacts as correlated noise: where they are found, how uncertain their outcome is, and what that changes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.fit.effects.impacts import Impact, impact_deviations, impacts
+from concent_warp.fit.effects.impacts import Impact, flying_bodies, impact_deviations, impacts
 from concent_warp.fit.effects.observation import ObservationCfg, Window
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
@@ -91,6 +92,38 @@ def test_bodies_at_rest_in_flight_or_that_hop_a_little_have_none():
     assert impacts_of(prediction_of(0.3, height=0.0)) == []
     assert impacts_of(prediction_of(IMPACT - 0.01)) == []
     assert impacts_of(prediction_of(0.3, height=1e-4)) == []
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "0 0 -1"])
+def test_a_ball_on_slides_has_the_impacts_of_a_free_one_but_for_rotation(axis):
+    slides = f'<joint name="side" type="slide" axis="1 0 0"/><joint name="height" type="slide" axis="{axis}"/>'
+    text = SCENE.format(shift=0.0).replace("<freejoint/>", slides)
+    m = mujoco.MjModel.from_xml_string(text)
+    d, rows = mujoco.MjData(m), []
+    d.qpos[1] = HEIGHT * float(axis.split()[2])
+    for _ in range(300):
+        rows.append((d.qpos.copy(), d.qvel.copy()))
+        mujoco.mj_step(m, d)
+    qpos, qvel = map(np.array, zip(*rows, strict=True))
+    (free,) = impacts_of(prediction_of(0.3))
+    (found,) = impacts(m, SimpleNamespace(qpos=qpos, qvel=qvel), CFG)  # pyright: ignore[reportArgumentType]
+    assert (found.begin, found.step, found.dof, found.flies) == (free.begin, free.step, 0, free.flies)
+    np.testing.assert_allclose(found.std, free.std[:2], rtol=1e-6)
+
+
+def test_bodies_that_others_carry_or_that_turn_on_hinges_do_not_fly():
+    m = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody>
+      <body name="cart"><joint type="slide" axis="1 0 0"/><geom size="0.1"/>
+        <body name="rider" pos="1 0 0"><joint type="slide" axis="1 0 0"/><geom size="0.1"/></body></body>
+      <body name="door"><joint axis="0 0 1"/><geom size="0.1"/></body>
+      <body name="screw"><joint type="slide"/><joint axis="0 0 1"/><geom size="0.1"/></body>
+      <body name="ball" pos="0 0 1"><freejoint/><geom size="0.1"/></body>
+    </worldbody></mujoco>""")
+    assert [(m.body(f.body).name, f.turns, f.count) for f in flying_bodies(m)] == [
+        ("cart", False, 1),
+        ("ball", True, 6),
+    ]
 
 
 def test_what_follows_an_impact_is_uncertain_by_its_velocity_times_time_and_nothing_before_it():
