@@ -64,6 +64,8 @@ class Evidence:
     diagnosis: Diagnosis | None = None
     free_motion: str | None = None
     """File of the free motion that the effect was searched in, where it was and this was written."""
+    preference: str | None = None
+    """A sentence on why whole trials prefer its effect to one that explains as much of what it was searched for in."""
     misfit_with_effect: np.ndarray | None = None
     """Misfit with the missing effect, shape (T,)."""
     with_cause: SimulatedTrials | None = None
@@ -202,6 +204,8 @@ class Judge:
             said.append(bias_sentence(evidence.bias))
         if evidence.diagnosis is not None:
             said += diagnosis_sentences(evidence.diagnosis, numbers["explained by physics"])
+        if evidence.preference is not None:
+            said.append(evidence.preference)
         if evidence.with_cause is not None and cause in ("perception", "physics"):
             said.append(
                 f"With this in its own simulation, the policy succeeds in {evidence.with_cause.rate:.0%} of "

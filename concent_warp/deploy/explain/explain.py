@@ -21,9 +21,10 @@ from concent_warp.deploy.explain.pose_bias import PoseBias, PoseBiasSearch, corr
 from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
 from concent_warp.deploy.explain.replay_trial import Replayer
 from concent_warp.deploy.explain.result import Explanation
+from concent_warp.deploy.explain.whole_trials import better_in_whole_trials
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.tasks import Progress, ignore_progress
 from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ConcentError, ModelError, RecordingError, TrainError
@@ -219,13 +220,28 @@ class _Explaining:
         def progress(share: float, text: str) -> None:
             self._progress(0.45 + 0.45 * share, f"diagnosing: {text}")
 
-        diagnosis = diagnose(self._policy.run.model, recording, settings, out=out, progress=progress)
-        explained = None
-        if diagnosis.accepted:
-            replayer = Replayer(self._own.task, diagnosis.model)
-            contact, scale = self._preparation.contact, evidence.joint_scale
-            explained = np.array([t.misfit(replayer, contact, scale) for t in evidence.trials])
-        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=explained)
+        model = self._policy.run.model
+        diagnosis = diagnose(model, recording, settings, out=out, progress=progress)
+
+        def explained(finding: Finding) -> np.ndarray:
+            values = {p.name: p.value for p in finding.parameters}
+            name = finding.name.partition("(")[0]
+            return evidence.explained(self._misfit(evidence, model.add_effect(name, finding.target, values)))
+
+        better = better_in_whole_trials(diagnosis.effects, explained, cfg.judge)
+        if better is not None:
+            name = better[0].name.partition("(")[0]
+            again = None if self._out is None else Path(self._out) / f"diagnosis_{name}"
+            other = diagnose(model, recording, replace(settings, effects=(name,)), out=again, progress=progress)
+            if other.accepted:
+                diagnosis, evidence = other, replace(evidence, preference=better[1])
+        after = self._misfit(evidence, diagnosis.model) if diagnosis.accepted else None
+        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=after)
+
+    def _misfit(self, evidence: Evidence, model: Model) -> np.ndarray:
+        """Return the misfits of the trials' replays in a model, shape (T,)."""
+        replayer, contact = Replayer(self._own.task, model), self._preparation.contact
+        return np.array([t.misfit(replayer, contact, evidence.joint_scale) for t in evidence.trials])
 
     def _free_motion(self, trials: Sequence[PreparedTrial]) -> Recording:
         """Return trials up to where the object comes near anything but the hand, those in which this takes longest."""
