@@ -8,6 +8,7 @@ import pytest
 
 from concent_warp.effects.effect import Effect, Parameter, variant_fields
 from concent_warp.effects.force_model import ForceModel
+from concent_warp.effects.library.objects import AXES
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import EngineError
 from concent_warp.model import Model
@@ -67,21 +68,23 @@ def typical(effect: Effect, m) -> list[float]:
     ]
 
 
-def on_every_target(model: Model, names: Sequence[str]) -> list[Effect]:
-    """Return effects that fields, force models and commands can express, on each target."""
+def on_every_target(model: Model, names: Sequence[str], part: str = "") -> list[Effect]:
+    """Return effects that fields, force models and commands can express, on each target or on a part of each."""
     m = model.compile()
     found = [cls(*target) for name in names for cls in [effect_classes()[name]] for target in cls.targets(m)]
-    return [effect for effect in found if not effect.edits]
+    return [e for e in found if not e.edits and (e.target[-1] if e.is_part else "") == part]
 
 
-def all_at_once(device: str, names: Sequence[str] = ON_MOTION) -> tuple[list[Effect], np.ndarray, np.ndarray]:
+def all_at_once(
+    device: str, names: Sequence[str] = ON_MOTION, part: str = ""
+) -> tuple[list[Effect], np.ndarray, np.ndarray]:
     """Simulate a world without effects and one for each effect, on both engines.
 
     Returns:
         The effects, and qpos of both engines, each of shape (1 + effects, STEPS + 1, nq).
     """
     model = Model(Scene(SCENE))
-    chosen = on_every_target(model, names)
+    chosen = on_every_target(model, names, part)
     values = [typical(effect, model.compile()) for effect in chosen]
     for effect in chosen:
         model = model.add(effect)
@@ -124,6 +127,11 @@ def test_every_effect_changes_the_motion_alike_on_both_engines():
 
 def test_air_changes_the_motion_alike_on_both_engines():
     assert_parity(*all_at_once("cpu", AIR))
+
+
+@pytest.mark.parametrize("part", AXES)
+def test_single_moments_of_inertia_change_the_motion_alike_on_both_engines(part):
+    assert_parity(*all_at_once("cpu", ("inertia",), part))
 
 
 @pytest.mark.gpu
