@@ -47,6 +47,12 @@ def test_of_several_the_best_is_preferred_and_said() -> None:
     assert "joint_friction explains 60%" in found[1]
 
 
+def test_of_equal_ones_that_of_the_largest_gain_is_preferred() -> None:
+    stribeck = finding("stribeck_friction", 0.87)
+    shares = {"backlash": 0.05, "joint_friction": 0.6, "stribeck_friction": 0.61}
+    assert chosen([PLAY, stribeck, FRICTION], shares) == "joint_friction"
+
+
 def test_effects_that_explain_less_where_they_were_searched_for_are_no_rivals() -> None:
     shares = {"backlash": 0.05, "joint_friction": 0.6}
     assert chosen([PLAY, finding("joint_friction", 0.7)], shares) is None

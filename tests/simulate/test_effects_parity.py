@@ -76,7 +76,7 @@ def on_every_target(model: Model, names: Sequence[str], part: str = "") -> list[
 
 
 def all_at_once(
-    device: str, names: Sequence[str] = ON_MOTION, part: str = ""
+    device: str, names: Sequence[str] = ON_MOTION, moment: str = ""
 ) -> tuple[list[Effect], np.ndarray, np.ndarray]:
     """Simulate a world without effects and one for each effect, on both engines.
 
@@ -84,7 +84,7 @@ def all_at_once(
         The effects, and qpos of both engines, each of shape (1 + effects, STEPS + 1, nq).
     """
     model = Model(Scene(SCENE))
-    chosen = on_every_target(model, names, part)
+    chosen = on_every_target(model, names, moment)
     values = [typical(effect, model.compile()) for effect in chosen]
     for effect in chosen:
         model = model.add(effect)

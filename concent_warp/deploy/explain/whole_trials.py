@@ -21,7 +21,8 @@ def better_in_whole_trials(
     """Return the effect that whole trials prefer to the one that was named, and a sentence; None where there is none.
 
     Rivals are effects whose held-out gain lies in the interval of the named one's or above. One is preferred where it
-    explains more of the trials' difference, by `JudgeCfg.least_gain` of it in the median trial, by a signed-rank test.
+    explains more of the trials' difference, by `JudgeCfg.least_gain` of it in the median trial, by a signed-rank test;
+    of several, that of the largest gain, unless another explains as much more.
 
     Args:
         effects: Findings of a diagnosis.
@@ -41,7 +42,7 @@ def better_in_whole_trials(
         test: Any = wilcoxon(more, alternative="greater")
         if test.pvalue > cfg.significance:
             continue
-        if best is None or share > best[0]:
+        if best is None or share > best[0] + cfg.least_gain:
             best = share, rival
     if best is None:
         return None
