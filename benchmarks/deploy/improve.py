@@ -77,12 +77,14 @@ that were begun have their second trials. The time of the host ended then: the l
 common trials (`-`: not judged), *true effect* and *randomised* were begun for three seeds and not tried, and one seed
 whose second trials were below 95 % had no second round. Two trainings that were finished and four that were not had
 been lost with another machine before; they were begun again. The first explanation and fit of each took 200 to 550 s
-of about half a core; training and 60 trials 6 minutes, with up to ten trainings on two GPUs and 32 cores.
+of about half a core of another machine, two cores of an AMD EPYC; training and 60 trials 6 minutes, with up to ten
+trainings on two GPUs and 32 cores. Where the last policy was not judged, the second trials are those that the running
+command had printed. Revision `f0873049`, which searched in the free motion of the first four trials.
 
 In one of ten the wrong effect was named: in the free motion of four trials play explains 83 % of the held-out error and
 friction 88 %, but friction has seven parameters and play one. In the model with play the policy learned what fails
-always. Since then whole trials decide between effects that explain the free motion alike; tried on the failed trials of
-this seed, they prefer friction. It was not trained again.
+always. Since then the longest free motion of six trials is taken, and whole trials decide between effects that
+explain it alike; tried on the failed trials of this seed, they prefer friction. It was not trained again.
 """
 
 

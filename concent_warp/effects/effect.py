@@ -105,6 +105,8 @@ class Effect:
     rarity: ClassVar[float] = 0.0
     """Twice the logarithm of how much rarer it is than a wrong friction or mass; orders effects that the data do
     not distinguish."""
+    parts: ClassVar[tuple[str, ...]] = ()
+    """Parts of an element that a target may name after it; each is a candidate by itself."""
     special_cases: ClassVar[tuple[str, ...]] = ()
     """Names of effects of fewer parameters that it equals at some of its values; it is not named beside one of them
     that explains as much."""
@@ -197,17 +199,22 @@ class Effect:
         return other.name in self.special_cases
 
     @property
+    def part(self) -> str:
+        """The part of the elements that the target names, one of `parts`; empty where it names none."""
+        return self.target[-1] if len(self.target) > 1 and self.target[-1] in self.parts else ""
+
+    @property
     def elements(self) -> tuple[str, ...]:
-        """Names of the joints, actuators, bodies, geoms or sensors among the target; all of it, by default."""
-        return self.target
+        """Names of the joints, actuators, bodies, geoms or sensors among the target."""
+        return self.target[:-1] if self.part else self.target
 
     @property
     def is_part(self) -> bool:
-        """Whether its target names a part of the elements too.
+        """Whether its target names a part of the elements.
 
         A diagnosis considers parts only where no other candidate explains the data: there are many of them.
         """
-        return len(self.target) > len(self.elements)
+        return bool(self.part)
 
     @property
     def edits(self) -> bool:
@@ -247,6 +254,8 @@ class Effect:
             return
         known = _names(m, self.kind)
         expected = f"{'bodies' if self.kind == 'body' else f'{self.kind}s'} among {known}"
+        if self.parts:
+            expected += f", after them {', '.join(self.parts)} or none"
         if unknown := [name for name in self.elements if name not in known]:
             raise ModelError(f"{self.name} has an unknown target", expected=expected, found=unknown)
         if not self.target:

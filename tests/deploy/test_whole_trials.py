@@ -1,4 +1,4 @@
-"""Effects that explain free motion alike are told apart by whole trials."""
+"""Effects that explain free motion alike are distinguished by whole trials."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from concent_warp.effects.library.contact import PadFriction, SlidingFriction
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
 from concent_warp.effects.library.joints import JointDamping, JointFriction
 from concent_warp.effects.library.measurement import Latency
-from concent_warp.effects.library.objects import Mass
+from concent_warp.effects.library.objects import Inertia, Mass
 from concent_warp.effects.library.world import GravityTilt
 from concent_warp.effects.registry import OURS, effect_class, effect_classes
 from concent_warp.effects.table import checked_values, effects_table, read_effects
@@ -254,6 +254,10 @@ BARE = '<body name="bare"><joint/><geom size=".1" contype="0" conaffinity="0"/><
         (Mass(), r"mass has no target.*bodies among \['world', 'thing', 'bare'\].*none"),
         (SlidingFriction("thing", "bare"), r"cannot act on these targets.*geoms that collide.*\['bare'\]"),
         (JointDamping("slide"), "joint_damping has an unknown target"),
+        (
+            Inertia("stone", "axis_q"),
+            r"inertia has an unknown target.*after them axis_x, axis_y.*\['stone', 'axis_q'\]",
+        ),
         (Latency("position", "force"), r"latency has an unknown target.*\['position', 'orientation'\].*\['force'\]"),
     ],
 )

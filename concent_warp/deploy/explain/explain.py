@@ -217,11 +217,11 @@ class _Explaining:
         )  # fmt: skip
         out = None if self._out is None else Path(self._out) / "diagnosis"
 
-        def progress(share: float, text: str) -> None:
-            self._progress(0.45 + 0.45 * share, f"diagnosing: {text}")
+        def between(begin: float, end: float) -> Progress:
+            return lambda share, text: self._progress(begin + (end - begin) * share, f"diagnosing: {text}")
 
         model = self._policy.run.model
-        diagnosis = diagnose(model, recording, settings, out=out, progress=progress)
+        diagnosis = diagnose(model, recording, settings, out=out, progress=between(0.45, 0.8))
 
         def explained(finding: Finding) -> np.ndarray:
             values = {p.name: p.value for p in finding.parameters}
@@ -232,7 +232,8 @@ class _Explaining:
         if better is not None:
             name = better[0].name.partition("(")[0]
             again = None if self._out is None else Path(self._out) / f"diagnosis_{name}"
-            other = diagnose(model, recording, replace(settings, effects=(name,)), out=again, progress=progress)
+            alone = replace(settings, effects=(name,))
+            other = diagnose(model, recording, alone, out=again, progress=between(0.8, 0.9))
             if other.accepted:
                 diagnosis, evidence = other, replace(evidence, preference=better[1])
         after = self._misfit(evidence, diagnosis.model) if diagnosis.accepted else None

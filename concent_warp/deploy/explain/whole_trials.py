@@ -1,4 +1,4 @@
-"""Effects that explain a short free motion alike, told apart by the whole trials, their contacts included."""
+"""Effects that explain a short free motion alike, distinguished by the whole trials, their contacts included."""
 
 from __future__ import annotations
 

@@ -65,21 +65,12 @@ class ContactGeometryOffset(BodyEffect):
         " pushed at an angle where faces are tilted, and lands turned where edges are worn"
     )
     confusions = ("size", "frame_offset", "center_of_mass", "length_scale")
+    parts = PARTS
 
     def __init__(self, *target: str) -> None:
         super().__init__(*target)
         if self.part:  # any of the parts is as rare as the whole: one by itself is that much rarer
             self.rarity = 2 * float(np.log(len(PARTS)))  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def part(self) -> str:
-        """The part of the body that is off, one of `PARTS`; empty for the places of its faces."""
-        return self.target[-1] if len(self.target) > 1 and self.target[-1] in PARTS else ""
-
-    @property
-    def elements(self) -> tuple[str, ...]:
-        """The bodies."""
-        return self.target[:-1] if self.part else self.target
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:

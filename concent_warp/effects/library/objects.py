@@ -127,16 +127,7 @@ class Inertia(BodyEffect):
     signature = "residual torque in proportion to angular acceleration; spins and rebounds too fast or too slow"
     confusions = ("armature", "size", "center_of_mass")
     requirement = "bodies that turn about several axes, where one moment of inertia is off"
-
-    @property
-    def part(self) -> str:
-        """The moments that are off, one of `AXES`; empty for all of them alike."""
-        return self.target[-1] if len(self.target) > 1 and self.target[-1] in AXES else ""
-
-    @property
-    def elements(self) -> tuple[str, ...]:
-        """The bodies."""
-        return self.target[:-1] if self.part else self.target
+    parts = AXES
 
     def has_as_special_case(self, other: Effect) -> bool:
         """Return whether another inertia of the same bodies has one factor, where this one has three."""
