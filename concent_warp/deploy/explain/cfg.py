@@ -154,7 +154,8 @@ class ExplainCfg:
     additions: Annotated[int, Bounds(1, 10)] = 1
     """Most missing effects that are named."""
     seconds: PositiveDuration | None = 600.0
-    """Time after which the search for an effect gives its best answer so far [s]; None: as long as it takes."""
+    """Time after which the search for an effect gives its best answer so far [s]; None: as long as it takes. A second
+    one, for an effect that whole trials prefer, has as long again."""
     jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time of that search; -1: one per CPU."""
     seed: int = 0

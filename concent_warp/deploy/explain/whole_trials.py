@@ -48,7 +48,7 @@ def better_in_whole_trials(
         return None
     share, rival = best
     sentence = (
-        f"{named.name} explains what it was searched for in as well, but {np.median(mine):.0%} of the difference of "
-        f"whole trials, of which {rival.name} explains {share:.0%}."
+        f"{named.name} explains what it was searched for in as well, but only {np.median(mine):.0%} of the difference "
+        f"of whole trials, where {rival.name} explains {share:.0%}."
     )
     return rival, sentence
