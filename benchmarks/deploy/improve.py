@@ -84,7 +84,8 @@ command had printed. Revision `f0873049`, which searched in the free motion of t
 In one of ten the wrong effect was named: in the free motion of four trials play explains 83 % of the held-out error and
 friction 88 %, but friction has seven parameters and play one. In the model with play the policy learned what fails
 always. Since then the longest free motion of six trials is taken, and whole trials decide between effects that
-explain it alike; tried on the failed trials of this seed, they prefer friction. It was not trained again.
+explain it alike: `concent explain` of the same trials names friction, 3.0 to 3.2 N m at the first four joints. It was
+not trained again.
 """
 
 
