@@ -139,6 +139,14 @@ class Effect:
         """Return the selections to which the effect may apply in a model; each is a separate candidate."""
         raise NotImplementedError
 
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:  # noqa: ARG003
+        """Return the single elements that are candidates of their own beside `targets`, each a selection.
+
+        None by default. An effect that has one value for all elements of a selection may act on one of them alone.
+        """
+        return ()
+
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:  # noqa: ARG002
         """Return whether the effect may act on the joint, actuator, body, geom or sensor of an id."""
         return True

@@ -85,6 +85,11 @@ def arm_actuators(m: mujoco.MjModel) -> tuple[str, ...]:
     )
 
 
+def each_of_several(selections: Iterable[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    """Return each element of the selections that have several, as a selection of its own."""
+    return tuple((name,) for names in selections if len(names) > 1 for name in names)
+
+
 def servo_gain(m: mujoco.MjModel, actuator: int) -> float:
     """Return the position gain of a position-controlled actuator, 0 for another."""
     gain, bias = float(m.actuator_gainprm[actuator, 0]), float(m.actuator_biasprm[actuator, 1])

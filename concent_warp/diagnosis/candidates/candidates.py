@@ -24,7 +24,7 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
     chosen = [effect_class(name) for name in names] if names else list(effect_classes().values())
     found: list[Effect] = []
     for kind in chosen:
-        for target in kind.targets(m):
+        for target in (*kind.targets(m), *kind.single_targets(m)):
             if kind.kind == "sensor":
                 target = tuple(t for t in target if t in channels)
                 if not target:

@@ -131,7 +131,7 @@ def indistinguishable(
     better than that of the missing one, as simulations of the same formula differ too; it must not leave more than the
     most plausible one by as much. One whose posterior odds against the most plausible are worse than `max_odds` is left
     out, and so is one that has another one of them as a special case: what its further parameters explain is no
-    evidence.
+    evidence. Nor is it evidence of an effect on several elements that one on a part of these explains as much.
 
     Args:
         base: The fitted baseline.
@@ -145,6 +145,11 @@ def indistinguishable(
         rarer = best.effect.rarity - c.effect.rarity > _log_errors(base, c) - _log_errors(base, best)
         if rarer or _leaves_as_little(c, best, cfg, slack):
             group.append((c, f))
+    group = [
+        pair
+        for pair in group
+        if not any(_is_on_part(other, pair[0]) and _leaves_as_little(other, pair[0], cfg, slack) for other, _ in group)
+    ]
     ranked = sorted(((_plausibility(base, *pair), pair) for pair in group), key=lambda found: -found[0])
     first, _ = ranked[0][1]
     return [
@@ -157,6 +162,11 @@ def indistinguishable(
             and not any(c.effect.has_as_special_case(other.effect) for other, _ in group)
         )
     ]
+
+
+def _is_on_part(one: FittedCandidate, other: FittedCandidate) -> bool:
+    """Return whether a candidate is the effect of another one on some of its elements."""
+    return one.effect.name == other.effect.name and set(one.effect.elements) < set(other.effect.elements)
 
 
 def _leaves_as_little(c: FittedCandidate, other: FittedCandidate, cfg: SearchCfg, slack: float) -> bool:

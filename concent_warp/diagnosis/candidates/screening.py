@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -169,10 +169,15 @@ def _scan(
     count = int(np.searchsorted(np.cumsum(before[order]), cfg.first_scanned_share * before.sum())) + 1
     first, rest = order[:count].tolist(), order[count:].tolist()
     first_before, total = float(before[first].sum()), max(float(before.sum()), 1e-12)
+    unlimited = not np.isfinite(values).all()
+
+    def left_first(moved: np.ndarray) -> float:
+        return robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
+
     for outward in _outward(solver, values):
         least = np.inf
-        for moved in outward:
-            left = robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
+        for moved in outward[_idle(outward, left_first) if unlimited else 0 :]:
+            left = left_first(moved)
             least = min(least, left)
             if left > max(cfg.max_scanned_rise * least, first_before):
                 break
@@ -183,6 +188,22 @@ def _scan(
             if 1 - left / total > best:
                 best, start = 1 - left / total, moved
     return best, start
+
+
+def _idle(outward: Sequence[np.ndarray], left: Callable[[np.ndarray], float]) -> int:
+    """Return how many of the first values of a limit, from the largest down, are never reached: these leave the same.
+
+    Args:
+        outward: Scanned parameters, (P,) each.
+        left: Returns the robust sum of squares that parameters leave.
+    """
+    if len(outward) < 2:
+        return 0
+    unreached, low, high = left(outward[0]), 0, len(outward)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if left(outward[middle]) == unreached else (low, middle)
+    return low
 
 
 def _outward(solver: Solver, values: np.ndarray) -> Iterator[list[np.ndarray]]:

@@ -16,6 +16,7 @@ from concent_warp.effects.select import (
     arm_actuators,
     dof_of,
     driven_joints,
+    each_of_several,
     element_name,
     gripper_actuators,
     robot_bodies,
@@ -146,6 +147,11 @@ class ActuatorSaturation(DriveEffect):
     confusions = ("actuator_gain", "actuator_lag")
     FREE = 1e6
 
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each of several drives: a common value is far off where one drive alone is weak."""
+        return each_of_several(cls.targets(m))
+
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Give each actuator a limit, far away."""
         for n in self.target:
@@ -252,6 +258,11 @@ class Backlash(ServoEffect):
     source = "play between inertias: Nordin and Gutman, Automatica 38(10), 2002; the rotor's left out"
     signature = "error that flips by the play at each reversal of the load; free swing in between"
     confusions = ("joint_friction", "stribeck_friction", "joint_compliance")
+
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each of several drives: a common value is far off where one drive alone has play."""
+        return each_of_several(cls.targets(m))
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Make room for how far each rotor is ahead of its link."""
