@@ -253,6 +253,12 @@ class TimeStepCfg:
     max_renewals: Count = 5
     """Most times that what a shorter step changes is computed again about the fit to it, until it changes by less than
     `max_error`."""
+    max_error_left: Positive = 1.0
+    """Error over the noise that a shorter step may still have, above which nothing is said to be missing that may be
+    this error [-]: the noise itself."""
+    error_factor: Factor = 1.5
+    """By how much that error may be larger than a first-order one [-]: motion that amplifies small differences does.
+    Empirical."""
     decisive_gain: Share = 0.9
     """Share of the error that a shorter step must remove to be used before effects are looked for [-]: an effect that
     removes more still is more likely to stand in for the step and a part of what else is missing. Empirical."""

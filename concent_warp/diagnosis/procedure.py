@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.residuals import instrument_noise
-from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.baseline import errors_like, fit_baseline
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.cfg import DiagnoseCfg
@@ -25,7 +25,7 @@ from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.replayed import Replayed, replayed
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio
+from concent_warp.diagnosis.search.adequacy import discrepancies, hidden_by_noise, is_lacking, least_ratio
 from concent_warp.diagnosis.search.alternatives import try_alternatives
 from concent_warp.diagnosis.search.context import (
     ADDITIONS_DONE,
@@ -38,6 +38,7 @@ from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.impact_errors import stand
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
+from concent_warp.diagnosis.search.time_step import may_be_step
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
@@ -115,6 +116,8 @@ class Procedure:
         fitted = revision.restore_given(revision.simplified(fitted), given)
         fitted = revision.final_values(revision.profiled(fitted))
         found = self.conclude(given, fitted, detectable, issues)
+        if found.verdict == "none_needed" and (hidden := hidden_by_noise(fitted[-1], noises, cfg)) is not None:
+            found = replace(found, issues=(*found.issues, hidden))
         runner.progress(1.0, "done")
         return found
 
@@ -299,7 +302,7 @@ class Procedure:
         record, least, fitted = self.record, self.context.cfg.min_gain, [base]
         for step, one in enumerate(coarse[1:]):
             after = self._refitted(one.model, base.windows)
-            if 1 - after.errors.sum() / max(fitted[-1].errors.sum(), 1e-12) < least:
+            if 1 - errors_like(after, fitted[-1]).sum() / max(fitted[-1].errors.sum(), 1e-12) < least:
                 record.keep_groups(step)
                 reason = "explains nothing more over longer windows"
                 record.refuse(lambda f, step=step: f.step >= step, reason)
@@ -413,6 +416,9 @@ class Procedure:
             verdict = "group" if any(len(group) > 1 for group in record.groups) else "effect"
         explained = verdict == "none_needed" or not cfg.explain
         verdict = budget.verdict(verdict, [f.step for f in record.findings if f.accepted])
+        step = record.time_step
+        if verdict == "none_of_these" and not adequate and step is not None and may_be_step(last, step, cfg.time_step):
+            verdict, step = "unsettled", replace(step, too_long=True)
         named = verdict in ("effect", "group")
         unsettled = "Left out: where the model fails, and the next experiment."
         where = budget.attempt(lambda: () if explained else self._failures(given), (), unsettled)
@@ -435,7 +441,7 @@ class Procedure:
             form_error=form_error if named else None,
             remainder_searched=not budget.cut if named else None,
             replayed=alike,
-            time_step=record.time_step,
+            time_step=step,
             holding=record.holding,
             nominal_values=record.nominal_values,
             unsettled=tuple(budget.unsettled),

@@ -26,6 +26,8 @@ VERDICTS: dict[Verdict, str] = {
     "unsettled": "the time did not suffice for a verdict",
 }
 """Verdicts in words."""
+STEP_TOO_LONG = "the time step of the model is too long for a verdict"
+"""The same of "unsettled" where no time was short."""
 
 
 @dataclass(frozen=True)
@@ -185,19 +187,34 @@ class FinerTimeStep:
     high: float
     """Upper end."""
 
+    too_long: bool = False
+    """Whether the error that the used step still has may be all that is left, so that nothing can be said."""
+
+    @property
+    def error(self) -> float:
+        """Error of the predictions that the used step still has over the noise [-]: in proportion to the step."""
+        return self.change / max(self.given / self.used - 1, 1e-12)
+
     @property
     def sentence(self) -> str:
         """A sentence on the time step."""
-        return (
+        said = (
             f"The model's time step of {1e3 * self.given:.3g} ms is too long for these data: with "
-            f"{1e3 * self.used:.3g} ms its predictions change by {self.change:.2g} x noise, and the held-out error "
+            f"{1e3 * self.used:.3g} ms its predictions change by {_times(self.change)} x noise, and the held-out error "
             f"falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]; the diagnosis uses it."
         )
+        if self.too_long:
+            said += (
+                f" Its own error is still about {_times(self.error)} x noise, which may be all that is left: shorten "
+                'the step of the model further, or set integrator="RK4" where it has no contacts, and diagnose again.'
+            )
+        return said
 
     def to_json(self) -> dict[str, Any]:
         """Return the time step in plain types."""
         gain = {"value": self.gain, "interval": [self.low, self.high]}
-        return {"given": self.given, "used": self.used, "change": self.change, "gain": gain}
+        return {"given": self.given, "used": self.used, "change": self.change, "gain": gain,
+                "error": self.error, "too_long": self.too_long}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -291,6 +308,8 @@ class Diagnosis:
             return "the library explains a part; something is missing that none of its effects explains"
         if self.replayed is not None and self.replayed.doubtful:
             return f"{VERDICTS[self.verdict]}, over short windows"
+        if self.verdict == "unsettled" and self.time_step is not None and self.time_step.too_long:
+            return STEP_TOO_LONG
         return VERDICTS[self.verdict]
 
     def to_json(self) -> dict[str, Any]:
@@ -430,6 +449,11 @@ def _parameter(p: FittedParameter) -> dict[str, Any]:
     """Return a fitted parameter in plain types."""
     interval = [_number(p.low), _number(p.high)]
     return {"name": p.name, "value": _number(p.value), "interval": interval, "unit": p.unit, "null": _number(p.null)}
+
+
+def _times(ratio: float) -> str:
+    """Return a ratio to the noise in words of two digits, without an exponent."""
+    return f"{ratio:.2g}" if ratio < 10 else f"{ratio:.0f}"
 
 
 def _number(value: float) -> float | None:

@@ -42,6 +42,11 @@ OBJECTS = {
 }
 
 
+PHASE_ERROR = 0.25
+"""Standard deviation of a delay due to the model's time step, over the step [-]: a semi-implicit step answers a force
+at its end as if it had acted from its beginning, half a step early, which is the 95 % interval."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number of an effect.
@@ -118,6 +123,8 @@ class Effect:
     null_error: ClassVar[float] = 0.0
     """Standard deviation of the null values relative to them [-]: by how much the model's own values of the quantity
     are uncertain, where it is no constant of the bodies. Part of the intervals."""
+    step_error: ClassVar[float] = 0.0
+    """Standard deviation of its values due to the model's time step, over the step [-]. Part of the intervals."""
     part_of: ClassVar[str] = ""
     """Name of the effect that is the same quantity without a tolerance, for a nominal value."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")

@@ -55,6 +55,7 @@ OURS: tuple[type[Effect], ...] = (
 NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalMass,
     nominal.NominalLength,
+    nominal.NominalInertia,
     nominal.NominalSize,
     nominal.NominalGain,
     nominal.NominalVelocityGain,

@@ -73,7 +73,9 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
         return "No discrepancy was detected: the model explains the measurements down to their noise."
     if diagnosis["verdict"] == "unsettled":
         best = f" The best so far: {_gain_sentence(accepted)}" if accepted else ""
-        return f"The time did not suffice for a verdict.{best}"
+        step = diagnosis.get("time_step") or {}
+        lead = "The time step of the model is too long" if step.get("too_long") else "The time did not suffice"
+        return f"{lead} for a verdict.{best}"
     if diagnosis["verdict"] == "group":
         group = next(g for g in groups if len(g) > 1)
         names = _listed([channel_text(name) for name in group])

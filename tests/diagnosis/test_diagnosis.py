@@ -8,10 +8,12 @@ from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment, SuggestedMotion, TimeSeries
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import (
+    STEP_TOO_LONG,
     VERDICTS,
     Detectable,
     Diagnosis,
     Finding,
+    FinerTimeStep,
     UnknownForceFound,
     _joined,
     _number,
@@ -222,3 +224,11 @@ def test_the_suggested_experiment_is_written_with_its_motion(tmp_path, monkeypat
     assert found.next_experiment is EXPERIMENT
     document = json.loads((tmp_path / "kept" / "next_experiment.json").read_text())
     assert document == json.loads(json.dumps(EXPERIMENT.to_json()))
+
+
+def test_a_time_step_that_is_too_long_for_a_verdict_is_named_as_the_reason():
+    step = FinerTimeStep(2e-3, 2.5e-4, 102.0, 0.98, 0.97, 0.99, too_long=True)
+    found = diagnosis(verdict="unsettled", effects=(), groups=(), time_step=step)
+    assert found.headline == STEP_TOO_LONG
+    assert "predictions change by 102 x noise" in found.sentences()[0]
+    assert diagnosis(verdict="unsettled", effects=()).headline == VERDICTS["unsettled"]

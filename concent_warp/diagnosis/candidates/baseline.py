@@ -15,7 +15,7 @@ from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
-from concent_warp.fit.effects.robust import huber_limit
+from concent_warp.fit.effects.robust import huber, huber_limit
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
@@ -99,6 +99,38 @@ def fitted_model(
     limit = huber_limit([piece.residual for piece in pieces], settings.robust)
     errors = held_out_errors(model, block_sums(pieces, blocks, limit), blocks, settings.prior)
     return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine, cfg)
+
+
+def errors_like(one: FittedModel, base: FittedModel) -> np.ndarray:
+    """Return the held-out error of each block of a fitted model, shape (B,), with the robust loss of another one.
+
+    The limit of the loss follows the spread of the residuals. Errors of which each has its own limit fall by more than
+    the residuals do where a few are large: those that are compared have that of the simpler model.
+
+    Args:
+        one: The fitted model.
+        base: What it is compared with, over the same blocks.
+    """
+    if one.limit == base.limit:
+        return one.errors
+    sums = block_sums(one.pieces, one.blocks, base.limit)
+    return held_out_errors(one.model, sums, one.blocks, one.cfg.least_squares.prior)
+
+
+def cost_like(one: FittedModel, base: FittedModel) -> float:
+    """Return the cost of the fit of a model with the robust loss of another one, see `errors_like`.
+
+    Args:
+        one: The fitted model.
+        base: What it is compared with.
+    """
+    if one.limit == base.limit:
+        return one.fit.cost
+    own, other = (
+        huber_limit([w.residual for w in fitted.fit.linear], fitted.cfg.least_squares.robust) for fitted in (one, base)
+    )
+    change = sum(float((huber(w.residual, other) - huber(w.residual, own)).sum()) for w in one.fit.linear)
+    return one.fit.cost + change
 
 
 def held_out_errors(model: Model, sums: Sums, blocks: Blocks, prior: float) -> np.ndarray:

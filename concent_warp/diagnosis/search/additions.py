@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import add_candidate
+from concent_warp.diagnosis.candidates.baseline import add_candidate, errors_like
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.candidates.evidence import largest_size, leaves_more
 from concent_warp.diagnosis.result import Detectable
@@ -100,11 +100,13 @@ class Additions:
                 break
             detectable = detectable or smallest
             equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
-            if bounded is not None and (best is None or not leaves_more(bounded[-1].errors, best.errors, cfg.search)):
+            if bounded is not None and (
+                best is None or not leaves_more(errors_like(bounded[-1], fitted[-1]), best.errors, cfg.search)
+            ):
                 record.forget(*recorded)
                 fitted, record.time_step = bounded, before
                 continue
-            if finer is not None and finer.errors.sum() <= equal:
+            if finer is not None and errors_like(finer, fitted[-1]).sum() <= equal:
                 record.forget(*recorded)
                 fitted = self._adopt(fitted, finer)
                 continue
@@ -199,7 +201,7 @@ class Additions:
 
     def _is_decisive(self, one: FittedModel, finer: FittedModel) -> bool:
         """Return whether a shorter time step explains so much that no effect may take its place."""
-        left = float(finer.errors.sum() / max(one.errors.sum(), 1e-12))
+        left = float(errors_like(finer, one).sum() / max(one.errors.sum(), 1e-12))
         return left <= 1 - self.context.cfg.time_step.decisive_gain
 
     def _with_nominal(
@@ -219,7 +221,7 @@ class Additions:
 
     def _needs_step(self, plain: FittedModel, finer: FittedModel) -> bool:
         """Return whether a model explains more with a shorter time step, which nominal values may stand in for."""
-        return bool(finer.errors.sum() < (1 - self.context.cfg.min_gain) * plain.errors.sum())
+        return bool(errors_like(finer, plain).sum() < (1 - self.context.cfg.min_gain) * plain.errors.sum())
 
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
         """Return the fitted models with the last one replaced by that with a shorter time step."""

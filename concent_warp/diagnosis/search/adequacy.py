@@ -8,6 +8,7 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.estimation.noise import Noise
 from concent_warp.fit.effects.robust import huber, robust_noise_ratio
 
 
@@ -41,6 +42,24 @@ def least_ratio(base: FittedModel, noise_factors: Mapping[str, float]) -> float:
         noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
     """
     return robust_noise_ratio(_scaled(base, noise_factors), base.cfg.least_squares.robust)
+
+
+def hidden_by_noise(base: FittedModel, noises: Mapping[str, Noise], cfg: DiagnoseCfg) -> str | None:
+    """Return a sentence where residuals of a model are well above the least noise that the readings allow, else None.
+
+    Args:
+        base: The fitted model.
+        noises: Noise of each channel that is not stated.
+        cfg: Settings.
+    """
+    least = {channel: max(noise.low / noise.std, 1e-3) for channel, noise in noises.items() if noise.std > 0}
+    largest = robust_noise_ratio(_scaled(base, least), base.cfg.least_squares.robust)
+    if largest <= cfg.form_error_ratio:
+        return None
+    return (
+        f"With the least noise that these readings allow, residuals are {largest:.2g} x noise: what is missing may be "
+        "hidden by the estimate. State the noise, of encoders their resolution / sqrt(12), and diagnose again."
+    )
 
 
 def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: DiagnoseCfg) -> bool:

@@ -12,6 +12,7 @@ from typing import get_args
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import errors_like
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.screening import robust_sum
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
@@ -60,7 +61,7 @@ def _holding(base: FittedModel, where: Holding, cfg: DiagnoseCfg) -> FittedModel
 
 def _finding(base: FittedModel, better: FittedModel, where: Holding, seed: int) -> HoldingFriction:
     """Return what friction that holds changes."""
-    gain = base.errors - better.errors
+    gain = base.errors - errors_like(better, base)
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
     settings = joint_constants(base.model.scene) if where == "joints" else {"impratio": f"{IMPRATIO:g}"}
     return HoldingFriction(where, settings, float(gain.sum() / max(base.errors.sum(), 1e-12)), low, high)

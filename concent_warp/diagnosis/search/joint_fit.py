@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import fitted_model
+from concent_warp.diagnosis.candidates.baseline import errors_like, fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.result import Finding
 from concent_warp.effects.posterior import JointPosterior
@@ -79,7 +79,7 @@ def joint_finding(
         without: The same without the effect, all else fitted again.
         seed: Seed of the bootstrap.
     """
-    gain, rng = without.errors - last.errors, np.random.default_rng(seed)
+    gain, rng = without.errors - errors_like(last, without), np.random.default_rng(seed)
     low, high = bootstrap_interval(gain, without.errors, last.blocks.demonstration, rng)
     share = float(gain.sum() / max(without.errors.sum(), 1e-12))
     return replace(finding, parameters=parameters, gain=share, low=low, high=high)
@@ -167,7 +167,9 @@ def _errors(
     formula = np.zeros(len(data))
     for k, part in enumerate(prediction.split):
         effect, values = last.model.effects[k].effect, last.fit.values[part]
-        formula[part] = formula_errors(effect, prediction.parameters[part], values, last.cfg.discretisation_error)
+        formula[part] = formula_errors(
+            effect, prediction.parameters[part], values, last.cfg.discretisation_error, last.timestep
+        )
         if widening is not None and k in widening:
             data[part] = data[part] * widening[k]
     return _Errors(data, np.zeros(len(data)) if nominal is None else nominal, formula)

@@ -49,7 +49,7 @@ def with_nominal_values(
     ]
     little = found.ratio <= cfg.bounded_ratio or (enough is not None and enough(found))
     inside = little or not any(p.at_bound for p in bounded)
-    sums, prior = block_sums(found.pieces, found.blocks, found.limit), base.cfg.least_squares.prior
+    sums, prior = block_sums(found.pieces, found.blocks, base.limit), base.cfg.least_squares.prior
     # Here the values themselves are judged: each fold is predicted from those of the others.
     errors = HeldOut(sums, found.blocks, prior).of_fit()
     return found if inside and errors.sum() <= (1 - min_gain) * base.errors.sum() else None

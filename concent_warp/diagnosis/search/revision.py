@@ -12,7 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_without_effect, without_effect
+from concent_warp.diagnosis.candidates.baseline import (
+    add_candidate,
+    cost_like,
+    errors_like,
+    refit_without_effect,
+    without_effect,
+)
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
@@ -293,7 +299,7 @@ def _gain_over(reduced: FittedModel, last: FittedModel) -> float:
 
     Held-out errors come from linear steps, which the bounds of the parameters do not stop.
     """
-    pairs = ((last.errors.sum(), reduced.errors.sum()), (last.fit.cost, reduced.fit.cost))
+    pairs = ((errors_like(last, reduced).sum(), reduced.errors.sum()), (cost_like(last, reduced), reduced.fit.cost))
     return float(max(1 - less / max(more, 1e-12) for less, more in pairs))
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import fitted_model
+from concent_warp.diagnosis.candidates.baseline import errors_like, fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.screening import robust_sum
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
@@ -112,7 +112,7 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
         finer: The same with the shorter one.
         seed: Seed of the bootstrap.
     """
-    gain = base.errors - finer.errors
+    gain = base.errors - errors_like(finer, base)
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
     change = [a - b for a, b in zip(_residuals(finer), _residuals(base), strict=True)]
     return FinerTimeStep(
@@ -123,6 +123,19 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
         low=low,
         high=high,
     )
+
+
+def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> bool:
+    """Return whether what a model leaves may be the error that the shorter time step still has.
+
+    Args:
+        last: The fitted model.
+        step: The time step that it uses.
+        cfg: Settings.
+    """
+    if step.error <= cfg.max_error_left:
+        return False
+    return bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
 
 
 def _without_defects(one: FittedModel) -> FittedModel:
@@ -147,7 +160,7 @@ def refitted(one: FittedModel) -> FittedModel:
 
 def explains_more(base: FittedModel, finer: FittedModel, cfg: DiagnoseCfg) -> bool:
     """Return whether the held-out error falls by a relevant and significant share."""
-    gain, rng = base.errors - finer.errors, np.random.default_rng(cfg.seed)
+    gain, rng = base.errors - errors_like(finer, base), np.random.default_rng(cfg.seed)
     relevant = gain.sum() >= cfg.min_gain * base.errors.sum()
     return bool(relevant and sign_flip_p(gain, rng) <= cfg.significance_level)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.effects.effect import Effect, Parameter, Reader
+from concent_warp.effects.effect import PHASE_ERROR, Effect, Parameter, Reader
 from concent_warp.effects.library.elastic_forces import SLOTS, ElasticGearForce
 from concent_warp.effects.library.gear_forces import BacklashForce
 from concent_warp.effects.library.joints import MUJOCO
@@ -188,6 +188,7 @@ class ActuatorDelay(DriveEffect):
     source = "transport delay; linear between time steps"
     signature = "residuals in proportion to the commanded speed; all later by the same time"
     confusions = ("latency", "actuator_lag", "joint_damping")
+    step_error = PHASE_ERROR
     history = 0.3
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
@@ -219,6 +220,7 @@ class ActuatorLag(DriveEffect):
     source = "first-order lag, exact for commands that are held over a step; the mean over each step acts"
     signature = "rounded corners after steps of the command"
     confusions = ("actuator_delay", "joint_damping", "latency")
+    step_error = PHASE_ERROR
     history = 0.5
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002

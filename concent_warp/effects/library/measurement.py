@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.effects.effect import Effect, Parameter, Reader
+from concent_warp.effects.effect import PHASE_ERROR, Effect, Parameter, Reader
 from concent_warp.effects.select import JOINTS, POSES, sensors_by_type, shown_free_joint
 
 SCALES = (-0.03, -0.01, 0.01, 0.03)
@@ -58,6 +58,7 @@ class Latency(MeasurementEffect):
     summary = "What is stamped t was seen at t - delay."
     signature = "residuals in proportion to velocity, at the same delay in all phases"
     confusions = ("actuator_delay", "time_base")
+    step_error = PHASE_ERROR
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one delay."""

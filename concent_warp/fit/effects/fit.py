@@ -282,7 +282,7 @@ def _fitted_parameters(
     for effect, part in zip(solver.p.effects, solver.p.split, strict=True):
         if part.stop > part.start:
             formula[part] = formula_errors(
-                effect, solver.p.parameters[part], fit.values[part], cfg.discretisation_error
+                effect, solver.p.parameters[part], fit.values[part], cfg.discretisation_error, solver.p.timestep
             )
     clustered = clustered_std(sums, blocks, settings.prior)
     reaches = NORMAL_QUANTILE * np.hypot(clustered * solver.scale, formula)

@@ -159,16 +159,20 @@ def clustered_std(sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.pri
 
 
 def formula_errors(
-    effect: Effect, parameters: Sequence[Parameter], values: np.ndarray, discretisation_error: float
+    effect: Effect,
+    parameters: Sequence[Parameter],
+    values: np.ndarray,
+    discretisation_error: float,
+    timestep: float = 0.0,
 ) -> np.ndarray:
     """Return standard deviations of an effect's values due to its formula, in the units of these, shape (P,).
 
     Those of `discretisation_errors`, together with `Effect.formula_error` times each parameter's difference from its
-    null value, and `Effect.null_error` times that.
+    null value, `Effect.null_error` times that, and `Effect.step_error` times the model's time step [s].
     """
     null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
     own = np.where(np.isfinite(values), np.abs(values - null), 0.0)
-    form = np.hypot(effect.formula_error * own, effect.null_error * null)
+    form = np.hypot(np.hypot(effect.formula_error * own, effect.null_error * null), effect.step_error * timestep)
     return np.hypot(discretisation_errors(parameters, values, discretisation_error), form)
 
 

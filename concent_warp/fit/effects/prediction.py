@@ -138,6 +138,11 @@ class Prediction:
         """Simulated time so far [s]."""
 
     @property
+    def timestep(self) -> float:
+        """The time step of the model [s]."""
+        return float(self._base.scene.model.opt.timestep)
+
+    @property
     def compiled(self) -> mujoco.MjModel:
         """The compiled model at the start values, prepared for the effects."""
         return self._engine(self.start)[0].compiled
@@ -214,7 +219,7 @@ class Prediction:
         """Return how many steps cover a window, or its first part of some time [s]."""
         w = self.windows[window]
         span = w.end - w.start if time is None else min(time, w.end - w.start)
-        return max(int(np.ceil(span / self._base.scene.model.opt.timestep - 1e-9)), 1)
+        return max(int(np.ceil(span / self.timestep - 1e-9)), 1)
 
     def _simulate(
         self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[SimulationRequest], steps: int

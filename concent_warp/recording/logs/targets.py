@@ -41,6 +41,8 @@ OF_JOINTS: dict[int, tuple[Quantity, Quantity]] = {
     int(S.mjSENS_ACTUATORFRC): ("torque", "force"),
 }
 """Quantities of sensors of hinges and of slides."""
+LARGEST_ARM = 0.1
+"""Largest coefficients up to which those of a fixed tendon may be moment arms [m], and its length one in metres."""
 POSITIONS = (int(S.mjSENS_JOINTPOS), int(S.mjSENS_TENDONPOS), int(S.mjSENS_ACTUATORPOS))
 VELOCITIES = (int(S.mjSENS_JOINTVEL),)
 
@@ -135,7 +137,10 @@ def _joint(m: mujoco.MjModel, joint: int) -> tuple[bool | None, tuple[float, flo
 
 
 def _tendon(m: mujoco.MjModel, tendon: int) -> tuple[bool | None, tuple[float, float] | None]:
-    """Return whether the joints of a fixed tendon are hinges, None if not of one kind, and its range."""
+    """Return whether the joints of a fixed tendon are hinges, None if its length may be either, and its range.
+
+    It may be either where joints are not of one kind, and where coefficients of hinges are as small as moment arms.
+    """
     rows = slice(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
     if (m.wrap_type[rows] != mujoco.mjtWrap.mjWRAP_JOINT).any():
         span = m.tendon_range[tendon]
@@ -143,6 +148,8 @@ def _tendon(m: mujoco.MjModel, tendon: int) -> tuple[bool | None, tuple[float, f
     joints = m.wrap_objid[rows]
     kinds = {_joint(m, int(one))[0] for one in joints}
     angular = kinds.pop() if len(kinds) == 1 else None
+    if angular and float(np.abs(m.wrap_prm[rows]).max()) <= LARGEST_ARM:
+        angular = None
     if m.tendon_limited[tendon]:
         return angular, (float(m.tendon_range[tendon, 0]), float(m.tendon_range[tendon, 1]))
     if not m.jnt_limited[joints].all():

@@ -18,6 +18,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, Search
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cfg import EffectSolverCfg
+from concent_warp.fit.effects.robust import huber, huber_limit
 
 ANY: Any = None
 SETTINGS = EffectSolverCfg()
@@ -273,3 +274,23 @@ def test_an_effect_is_accepted_unless_there_is_a_reason_against_it(monkeypatch, 
     assert (found.gain, found.low, found.high) == (values["share"], values["low"], 0.9)
     assert (found.p, found.sign_p, found.smallest_p) == (values["p"], 0.02, 0.001)
     assert (found.parameters, found.removes) == (parameters, (("angle", 0.5),))
+
+
+def test_models_are_compared_by_the_robust_loss_of_the_simpler_one(monkeypatch):
+    monkeypatch.setattr(baseline, "block_sums", lambda _pieces, _blocks, limit: limit)
+    monkeypatch.setattr(baseline, "held_out_errors", lambda _model, limit, _blocks, _prior: np.array([limit]))
+
+    def fitted(residual: list[float], limit: float) -> Any:
+        own = huber_limit([np.array(residual)])
+        cost = 3.0 + huber(np.array(residual), own).sum()
+        fit = SimpleNamespace(linear=[SimpleNamespace(residual=np.array(residual))], cost=cost)
+        return SimpleNamespace(
+            fit=fit, limit=limit, cfg=SETTINGS, errors=np.array([-limit]), pieces=(), blocks=None, model=None
+        )
+
+    simple, other = fitted([2.0, 2.0, 2.0, 30.0], 11.0), fitted([1.0, 1.0, 1.0, 30.0], 5.0)
+    assert baseline.errors_like(other, simple).tolist() == [11.0]
+    assert baseline.errors_like(simple, simple).tolist() == [-11.0]
+    wide = huber_limit([np.array([2.0, 2.0, 2.0, 30.0])])
+    assert baseline.cost_like(other, simple) == pytest.approx(3.0 + 3 * 0.5 + huber(np.array([30.0]), wide).sum())
+    assert baseline.cost_like(other, other) == other.fit.cost

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
+from concent_warp.diagnosis.search.adequacy import discrepancies, hidden_by_noise, is_adequate, is_lacking
+from concent_warp.estimation.noise import Noise
 from tests.diagnosis.made_up import node
 
 
@@ -47,3 +48,15 @@ def test_the_unit_of_residuals_decides_neither_what_is_left_nor_what_is_lacking(
         assert discrepancies(scaled, first_scaled) == pytest.approx(discrepancies(plain, first))
         assert is_adequate(scaled, factors, cfg) == is_adequate(plain, factors, cfg) == (ratio < 1.5)
         assert is_lacking(scaled, factors, cfg) == is_lacking(plain, factors, cfg) == (ratio > 1.23)
+
+
+@pytest.mark.parametrize(("low", "said"), [(0.6, False), (0.2, True), (0.0, True), (1.0, False)])
+def test_residuals_above_the_least_noise_that_the_readings_allow_are_said(low, said):
+    one = node(0.8)
+    one.windows[0].readings = [SimpleNamespace(channel="angle", rows=slice(0, 1))]
+    one.pieces[0].residual = np.array([0.8])
+    sentence = hidden_by_noise(one, {"angle": Noise(1e-3, "differences", low * 1e-3, 1.1e-3)}, DiagnoseCfg())
+    assert (sentence is not None) == said
+    if low == 0.2:
+        assert sentence is not None
+        assert "residuals are 4 x noise" in sentence

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,15 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
+from concent_warp.diagnosis.result import FinerTimeStep
 from concent_warp.diagnosis.search import time_step as module
-from concent_warp.diagnosis.search.time_step import at_given_step, finding, finer_time_step, renew_defects
+from concent_warp.diagnosis.search.time_step import (
+    at_given_step,
+    finding,
+    finer_time_step,
+    may_be_step,
+    renew_defects,
+)
 from concent_warp.effects.registry import effect_class
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -222,3 +230,17 @@ def test_states_far_off_are_fitted_by_simulations_with_the_shorter_step():
     assert simulated_steps(found) == TIMESTEP
     near = replace(lost, fit=replace(one.fit, offsets=(*spoiled[:1], np.full(2, least), *spoiled[2:])))
     assert module._at_states_of_shorter_step(near, TimeStepCfg()) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "ratio", "expected"), [(102.0, 13.8, True), (102.0, 23.0, False), (6.0, 1.3, False), (8.0, 1.9, True)]
+)
+def test_what_may_be_the_error_of_the_shorter_step_is_no_sign_that_something_is_missing(change, ratio, expected):
+    last: Any = SimpleNamespace(noise_ratio=ratio)
+    step = FinerTimeStep(2e-3, 2.5e-4, change, 0.98, 0.97, 0.99)
+    assert step.error == pytest.approx(change / 7)
+    assert may_be_step(last, step, TimeStepCfg()) == expected
+    assert "shorten the step" not in step.sentence
+    too_long = replace(step, too_long=True)
+    assert "shorten the step of the model further" in too_long.sentence
+    assert too_long.to_json()["too_long"]

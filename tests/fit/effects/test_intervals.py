@@ -8,8 +8,9 @@ import pytest
 
 from concent_warp.effects.effect import Parameter
 from concent_warp.effects.library.contact import ContactCompliance
+from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag
 from concent_warp.effects.library.joints import JointFriction
-from concent_warp.effects.library.measurement import LengthScale
+from concent_warp.effects.library.measurement import Latency, LengthScale
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
 from concent_warp.fit.effects.intervals import (
     FittedParameter,
@@ -95,6 +96,15 @@ def test_the_scatter_of_friction_adds_to_the_error_of_its_formula():
     assert each == pytest.approx([0.03 * 2.0, 0.03 * 8.0])
     (exact,) = formula_errors(LengthScale("a"), (p,), np.array([2.0]), 0.005)
     assert exact == pytest.approx(2.0 * 0.005)
+
+
+@pytest.mark.parametrize("kind", [ActuatorDelay, ActuatorLag, Latency])
+def test_a_delay_is_no_better_known_than_half_a_time_step(kind):
+    (p,) = parameters = (Parameter("delay", "s", 0.0, 0.0, 0.3, 0.02),)
+    (error,) = formula_errors(kind("a"), parameters, np.array([0.09]), 0.0, 0.004)
+    assert 1.96 * error == pytest.approx(0.002, rel=0.03)
+    assert formula_errors(kind("a"), parameters, np.array([0.09]), 0.0) == [0.0]
+    assert formula_errors(LengthScale("a"), (p,), np.array([0.09]), 0.0, 0.004) == [0.0]
 
 
 SETTLING = """<mujoco>

@@ -171,3 +171,12 @@ def test_maps_that_make_no_sense_are_refused(tmp_path, text, sentence):
     with pytest.raises(cw.RecordingError) as caught:
         read_map(tmp_path / "m.toml")
     assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize(("arm", "quantity"), [("-0.010", "any"), ("0.5", "angle"), ("1", "angle")])
+def test_the_length_of_a_fixed_tendon_with_moment_arms_may_be_in_metres(arm, quantity):
+    scene = f"""<mujoco><worldbody><body><joint name="knuckle" type="hinge"/><geom size=".1"/></body></worldbody>
+    <tendon><fixed name="flexor"><joint joint="knuckle" coef="{arm}"/></fixed></tendon>
+    <sensor><tendonpos name="excursion" tendon="flexor"/><jointpos name="turn" joint="knuckle"/></sensor></mujoco>"""
+    sensors = targets_of(cw.Scene(scene).model)[1]
+    assert (sensors["excursion"].quantity, sensors["turn"].quantity) == (quantity, "angle")
