@@ -116,7 +116,8 @@ class Procedure:
         fitted = revision.restore_given(revision.simplified(fitted), given)
         fitted = revision.final_values(revision.profiled(fitted))
         found = self.conclude(given, fitted, detectable, issues)
-        if found.verdict == "none_needed" and (hidden := hidden_by_noise(fitted[-1], noises, cfg)) is not None:
+        hidden = hidden_by_noise(fitted[-1], noises, cfg)
+        if hidden is not None and found.verdict in ("none_needed", "effect", "group"):
             found = replace(found, issues=(*found.issues, hidden))
         runner.progress(1.0, "done")
         return found

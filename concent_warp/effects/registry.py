@@ -57,6 +57,7 @@ NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalLength,
     nominal.NominalInertia,
     nominal.NominalSize,
+    nominal.NominalStiffness,
     nominal.NominalGain,
     nominal.NominalVelocityGain,
     nominal.NominalLatency,

@@ -138,3 +138,17 @@ def test_the_inertia_of_a_free_body_is_a_nominal_value_of_its_own():
     np.testing.assert_array_equal(heavier.body_mass, m.body_mass)
     assert kind.targets(Model(Scene(PUSHER)).compile()) == ()
     assert kind.part_of == "inertia"
+
+
+def test_the_springs_of_a_model_are_nominal_values():
+    kind = effect_class("nominal_stiffness")
+    sprung = """<mujoco><worldbody><body><joint name="loose"/><geom size=".1"/><body>
+    <joint name="sprung" stiffness="0.5"/>
+    <geom size=".1"/></body></body></worldbody></mujoco>"""
+    model = Model(Scene(sprung))
+    assert kind.targets(model.compile()) == (("sprung",),)
+    assert model.add_effect(kind.name, ["sprung"], {"stiffness[sprung]": 1.02}).compile().jnt_stiffness.tolist() == [
+        0,
+        0.51,
+    ]
+    assert kind.targets(Model(Scene(PUSHER)).compile()) == ()

@@ -45,13 +45,15 @@ def least_ratio(base: FittedModel, noise_factors: Mapping[str, float]) -> float:
 
 
 def hidden_by_noise(base: FittedModel, noises: Mapping[str, Noise], cfg: DiagnoseCfg) -> str | None:
-    """Return a sentence where residuals of a model are well above the least noise that the readings allow, else None.
+    """Return a sentence where what a model explains down to the noise is well above the least noise that may be.
 
     Args:
         base: The fitted model.
         noises: Noise of each channel that is not stated.
         cfg: Settings.
     """
+    if base.ratio > cfg.adequate_ratio:
+        return None
     least = {channel: max(noise.low / noise.std, 1e-3) for channel, noise in noises.items() if noise.std > 0}
     largest = robust_noise_ratio(_scaled(base, least), base.cfg.least_squares.robust)
     if largest <= cfg.form_error_ratio:

@@ -12,6 +12,7 @@ import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.library.drives import ActuatorGain
+from concent_warp.effects.library.joints import JointEffect
 from concent_warp.effects.library.measurement import MeasurementEffect
 from concent_warp.effects.library.objects import Inertia, Size, mass_fields
 from concent_warp.effects.select import element_name, free_bodies, free_body_targets
@@ -149,6 +150,38 @@ class NominalSize(Size):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor."""
         return nominal_parameters("size", self.target)
+
+
+class NominalStiffness(JointEffect):
+    """Stiffness of the springs that a model has in its joints, within its tolerance."""
+
+    name = "nominal_stiffness"
+    nominal = True
+    summary = (
+        "The stiffness of the joint's spring is the model's times a factor within the tolerance of nominal values."
+    )
+    source = "tolerance of nominal values"
+    signature = "residual torque in proportion to the spring's"
+    confusions = ("joint_stiffness", "actuator_gain")
+    part_of = "joint_stiffness"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the hinges and slides with a spring."""
+        found = tuple(n for names in super().targets(m) for n in names if m.jnt_stiffness[m.joint(n).id])
+        return (found,) if found else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor a joint."""
+        return nominal_parameters("stiffness", self.target)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Stiffness."""
+        return ("jnt_stiffness",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale it."""
+        m.jnt_stiffness[self.ids(m)] *= values
 
 
 class NominalGain(ActuatorGain):

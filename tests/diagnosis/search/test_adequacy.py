@@ -57,6 +57,7 @@ def test_residuals_above_the_least_noise_that_the_readings_allow_are_said(low, s
     one.pieces[0].residual = np.array([0.8])
     sentence = hidden_by_noise(one, {"angle": Noise(1e-3, "differences", low * 1e-3, 1.1e-3)}, DiagnoseCfg())
     assert (sentence is not None) == said
+    assert hidden_by_noise(node(1.3), {"angle": Noise(1e-3, "differences", 0.0, 1.1e-3)}, DiagnoseCfg()) is None
     if low == 0.2:
         assert sentence is not None
         assert "residuals are 4 x noise" in sentence
