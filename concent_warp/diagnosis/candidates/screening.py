@@ -169,14 +169,15 @@ def _scan(
     count = int(np.searchsorted(np.cumsum(before[order]), cfg.first_scanned_share * before.sum())) + 1
     first, rest = order[:count].tolist(), order[count:].tolist()
     first_before, total = float(before[first].sum()), max(float(before.sum()), 1e-12)
-    unlimited = not np.isfinite(values).all()
+    unlimited = np.isinf(values)
 
     def left_first(moved: np.ndarray) -> float:
         return robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
 
     for outward in _outward(solver, values):
         least = np.inf
-        for moved in outward[_idle(outward, left_first) if unlimited else 0 :]:
+        limits = unlimited.any() and all(np.isfinite(moved[unlimited]).all() for moved in outward)
+        for moved in outward[_idle(outward, left_first) if limits else 0 :]:
             left = left_first(moved)
             least = min(least, left)
             if left > max(cfg.max_scanned_rise * least, first_before):

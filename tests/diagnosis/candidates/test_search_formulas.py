@@ -186,7 +186,12 @@ def fitted(errors: np.ndarray, **changes: Any) -> Any:
     """Return a fitted candidate with held-out errors."""
     rarity = changes.pop("rarity", 0.0)
     effect = SimpleNamespace(
-        rarity=rarity, has_as_special_case=lambda _: False, name="mass", target=("x",), family="objects"
+        rarity=rarity,
+        has_as_special_case=lambda _: False,
+        name="mass",
+        target=("x",),
+        elements=("x",),
+        family="objects",
     )
     values = np.array([0.3, 1.7, -0.2, 5.0])
     base = FittedCandidate(
