@@ -55,7 +55,6 @@ OURS: tuple[type[Effect], ...] = (
 NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalMass,
     nominal.NominalLength,
-    nominal.NominalInertia,
     nominal.NominalSize,
     nominal.NominalStiffness,
     nominal.NominalGain,

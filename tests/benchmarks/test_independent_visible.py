@@ -32,7 +32,7 @@ def test_the_hidden_effect_is_that_of_the_library_with_its_true_values(name, eff
         assert found.values == pytest.approx(values, abs=1e-3)
         assert ("edge_x+z-" in found.effect.target) is found.effect.is_part
         beside = {a.effect.name for a in visible.nominal_values(Model(data.scene), found)}
-        assert {"nominal_mass", "nominal_inertia", "nominal_size", "nominal_latency"} >= beside
+        assert {"nominal_mass", "nominal_size", "nominal_latency"} >= beside
 
 
 def test_locked_sets_are_not_looked_at():

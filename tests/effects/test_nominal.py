@@ -127,19 +127,6 @@ def test_a_delay_beyond_the_tolerance_of_clocks_ends_at_the_bound():
     assert solver.fit().values[0] == pytest.approx(1e-3)
 
 
-def test_the_inertia_of_a_free_body_is_a_nominal_value_of_its_own():
-    kind = effect_class("nominal_inertia")
-    model = Model(Scene(BALL))
-    m = model.compile()
-    (target,) = kind.targets(m)
-    heavier = model.add_effect(kind.name, target, {f"inertia[{target[0]}]": 0.99}).compile()
-    moving = m.body(target[0]).id
-    np.testing.assert_allclose(heavier.body_inertia[moving], 0.99 * m.body_inertia[moving])
-    np.testing.assert_array_equal(heavier.body_mass, m.body_mass)
-    assert kind.targets(Model(Scene(PUSHER)).compile()) == ()
-    assert kind.part_of == "inertia"
-
-
 def test_the_springs_of_a_model_are_nominal_values():
     kind = effect_class("nominal_stiffness")
     sprung = """<mujoco><worldbody><body><joint name="loose"/><geom size=".1"/><body>

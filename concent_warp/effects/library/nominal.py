@@ -14,8 +14,8 @@ from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.effects.library.joints import JointEffect
 from concent_warp.effects.library.measurement import MeasurementEffect
-from concent_warp.effects.library.objects import Inertia, Size, mass_fields
-from concent_warp.effects.select import element_name, free_bodies, free_body_targets
+from concent_warp.effects.library.objects import Size, mass_fields
+from concent_warp.effects.select import element_name, free_bodies
 
 TOLERANCE = 0.01
 """Standard deviation of a nominal value over the value [-]: what scales, rulers and data sheets state as a rule."""
@@ -76,26 +76,6 @@ class NominalMass(NominalBodyValue):
         m.body_mass[ids] *= values
         m.body_gravcomp[ids] /= values
         m.body_inertia[ids] *= values[:, None]
-
-
-class NominalInertia(Inertia):
-    """Inertia of a free body within its tolerance, whatever its mass: of what spins or rolls it is all that counts."""
-
-    name = "nominal_inertia"
-    nominal = True
-    summary = "The inertia is the model's times a factor within the tolerance of nominal values; the mass stays."
-    source = "tolerance of nominal values"
-    confusions = ("inertia", "size")
-    part_of = "inertia"
-
-    @classmethod
-    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body."""
-        return free_body_targets(m)
-
-    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return one factor."""
-        return nominal_parameters("inertia", self.target)
 
 
 class NominalLength(NominalBodyValue):

@@ -42,8 +42,11 @@ PARAMETERS = (
 
 def solver_of(parameters: Any = PARAMETERS, split: Any = None, **options: Any) -> Any:
     split = split or [slice(k, k + 1) for k in range(len(parameters))]
-    names = [SimpleNamespace(name=f"effect_{k}", formula_error=0.0, null_error=0.0) for k in range(len(split))]
-    prediction = SimpleNamespace(parameters=parameters, split=split, effects=names)
+    names = [
+        SimpleNamespace(name=f"effect_{k}", formula_error=0.0, null_error=0.0, step_error=0.0)
+        for k in range(len(split))
+    ]
+    prediction = SimpleNamespace(parameters=parameters, split=split, effects=names, timestep=1e-3)
     scale = np.array([p.scale for p in parameters])
     high = np.array([p.high for p in parameters])
     return SimpleNamespace(p=prediction, cfg=LeastSquaresCfg(), scale=scale, high=high, **options)
