@@ -44,6 +44,8 @@ SEED = 600
 TEST = 900_000
 """Seed of the trials by which all arms are judged."""
 Arm = Literal["before", "rounds", "true effect", "randomised"]
+OTHERS: tuple[Arm, ...] = ("true effect", "randomised")
+"""Arms that are trained for as long as the rounds of the same seed, at least for one round."""
 CASES = (
     "joint_friction=3", "stribeck_friction=4", "joint_damping=30", "gravity_compensation=0.2", "actuator_delay=0.15",
     "actuator_lag=0.2", "actuator_gain=0.2", "backlash=0.015",
@@ -100,7 +102,7 @@ class Args:
     first: int = SEED
     """The first one, so that several commands can share the work."""
     arms: tuple[Arm, ...] = get_args(Arm)
-    """Arms to measure; *true effect* and *randomised* need *rounds*."""
+    """Arms to measure; *true effect* and *randomised* are trained on where *rounds* took longer than one."""
     jobs: int = 1
     """Arms at a time, a process each."""
     policy: str = "shape_sorter"
@@ -116,7 +118,7 @@ class Args:
     """Parallel environments, those of the policy's training by default."""
     episodes: int = 60
     """Trials of a round."""
-    trials: int = 200
+    trials: int = 100
     """Trials by which arms are judged."""
     seconds: float | None = None
     """Longest search for an effect [s]; by default as long as it takes."""
@@ -134,9 +136,9 @@ def main(args: Args) -> None:
     """Measure what is not done yet, and write the page."""
     kept = Measurements(args.data)
     seeds = [(case, args.first + k) for k in range(args.seeds) for case in args.names]
-    early: tuple[Arm, ...] = ("rounds", "before")
-    first: list[tuple[str, int, Arm]] = [(*one, arm) for arm in early if arm in args.arms for one in seeds]
-    left = [one for one in ([] if args.table else first) if kept.wanted(key(*one))]
+    order: tuple[Arm, ...] = ("rounds", "true effect", "randomised", "before")
+    every: list[tuple[str, int, Arm]] = [(*one, arm) for arm in order if arm in args.arms for one in seeds]
+    left = [one for one in ([] if args.table else every) if kept.wanted(key(*one))]
     devices: Queue[str | None] = get_context("spawn").Manager().Queue()
     for k in range(max(1, args.jobs)):
         devices.put(args.devices[k % len(args.devices)] if args.devices else None)
@@ -146,19 +148,18 @@ def main(args: Args) -> None:
         def begin(one: tuple[str, int, Arm], iterations: int = 0) -> None:
             running[pool.submit(study, *one, args, iterations)] = one
 
-        def follow(one: tuple[str, int]) -> None:
-            """Begin the arms that are trained for as long as the rounds of the same seed."""
-            others: tuple[Arm, ...] = ("true effect", "randomised")
-            trained = kept.rows.get(key(*one, "rounds"), {}).get("trained", -1)
-            for arm in others if trained >= 0 else ():
-                if arm in args.arms and kept.wanted(key(*one, arm)):
-                    begin((*one, arm), max(trained, args.iterations))
+        def longer(one: tuple[str, int]) -> None:
+            """Train the other arms on where the rounds of the same seed were trained for longer."""
+            trained = kept.rows.get(key(*one, "rounds"), {}).get("trained", 0)
+            for arm in OTHERS:
+                row = kept.rows.get(key(*one, arm), {})
+                if row.get("iterations", trained) < trained and (*one, arm) not in running.values():
+                    begin((*one, arm), trained)
 
         for one in left:
-            begin(one)
+            begin(one, args.iterations)
         for one in [] if args.table else seeds:
-            if (*one, "rounds") not in left:
-                follow(one)
+            longer(one)
         while running:
             for task in wait(running, return_when=FIRST_COMPLETED).done:
                 one = running.pop(task)
@@ -167,8 +168,7 @@ def main(args: Args) -> None:
                 except Exception as error:  # an arm that fails must not end the others
                     row = {"error": f"{type(error).__name__}: {error}"}
                 kept.add(key(*one), {"machine": machine((args.devices or ("cpu",))[0]), **row})
-                if one[2] == "rounds":
-                    follow(one[:2])
+                longer(one[:2])
     rows = {name: row for name, row in kept.rows.items() if "error" not in row}
     if rows and args.data == Args.data:
         write_page(NAME, page(rows))
@@ -203,6 +203,7 @@ def study(case: str, seed: int, arm: Arm, args: Args, iterations: int) -> dict[s
             row |= more
         elif arm != "before":
             policy = _trained(given, hidden, seed, arm, folder, args, iterations)
+            row["iterations"] = iterations
         row["seconds"] = time.perf_counter() - begun
         found = evaluate(policy, hidden, episodes=args.trials, seed=TEST + seed, device=_device)
     return row | {"successes": int(found.success.sum()), "trials": len(found.success)}
@@ -210,7 +211,7 @@ def study(case: str, seed: int, arm: Arm, args: Args, iterations: int) -> dict[s
 
 def _rounds(policy: Policy, hidden: EvaluateCfg, seed: int, folder: Path, args: Args) -> tuple[Policy, dict[str, Any]]:
     """Return the policy of the last round, and what the rounds found."""
-    jobs = 1 if args.jobs > 1 else -1
+    jobs = max(1, (os.cpu_count() or 1) // args.jobs) if args.jobs > 1 else -1
     cfg = ImproveCfg(
         rounds=args.rounds, target=args.target, episodes=args.episodes, iterations=args.iterations, worlds=args.worlds,
         seed=1000 * seed, explain=ExplainCfg(seconds=args.seconds, jobs=jobs, seed=seed), evaluate=hidden,

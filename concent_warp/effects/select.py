@@ -97,6 +97,15 @@ def servo_gain(m: mujoco.MjModel, actuator: int) -> float:
     return gain if affine and gain > 0 and abs(gain + bias) <= 1e-6 * gain else 0.0
 
 
+def servo_stiffness(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
+    """Return the stiffness [N m/rad or N/m] by which position-controlled drives of single joints hold each, shape (n,)."""
+    held = np.zeros(m.njnt)
+    for a in range(m.nu):
+        if m.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT):
+            held[m.actuator_trnid[a, 0]] += servo_gain(m, a) * m.actuator_gear[a, 0] ** 2
+    return held[joints]
+
+
 def robot_bodies(m: mujoco.MjModel) -> list[int]:
     """Return the bodies that an actuated joint carries."""
     roots = {int(m.jnt_bodyid[j]) for a in range(m.nu) for j in driven_joints(m, a)}

@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
-from concent_warp.effects.select import BEARINGS, SINGLE, dof_of, dofs_of, joints_by_type, typical_torque
+from concent_warp.effects.select import BEARINGS, SINGLE, dof_of, dofs_of, joints_by_type, servo_stiffness, typical_torque
 from concent_warp.scene.holding import FRICTION_IMPEDANCE, TIME_CONSTANT_STEPS
 
 if TYPE_CHECKING:
@@ -23,6 +23,11 @@ MUJOCO = "MuJoCo documentation, chapters Computation and Modeling"
 FARTHEST_REST = 1e4
 """Farthest rest position of a spring [rad or m]: from there its force is the same in all positions, to a single
 precision of the force."""
+
+
+LONGEST_LAG = 0.5
+"""Longest time by which damping makes a joint follow its position-controlled drive later [s], as that of a lag of the
+drive itself."""
 
 
 class JointEffect(Effect):
@@ -129,7 +134,8 @@ class JointDamping(BearingEffect):
         ids = self.ids(m)
         scale, null = typical_torque(m, ids), m.dof_damping[dof_of(m, ids)]
         unit = self.units(m, "N m s/rad", "N s/m")
-        return self.parameter_per_joint("damping", unit, null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
+        most = np.maximum.reduce([20 * scale, 5 * null, LONGEST_LAG * servo_stiffness(m, ids)])
+        return self.parameter_per_joint("damping", unit, null, 0.3 * scale, most)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Damping."""
