@@ -98,7 +98,7 @@ def servo_gain(m: mujoco.MjModel, actuator: int) -> float:
 
 
 def servo_stiffness(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
-    """Return the stiffness [N m/rad or N/m] by which position-controlled drives of single joints hold each, shape (n,)."""
+    """Return the stiffness [N m/rad or N/m] by which position-controlled drives hold each joint, shape (n,)."""
     held = np.zeros(m.njnt)
     for a in range(m.nu):
         if m.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT):

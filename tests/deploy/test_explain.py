@@ -14,6 +14,7 @@ import concent_warp as cw
 from concent_warp.deploy.explain.cfg import JudgeCfg
 from concent_warp.deploy.explain.evidence import Evidence, Judge
 from concent_warp.deploy.explain.explain import _Explaining
+from concent_warp.deploy.explain.failure_rate import FailureRates
 from concent_warp.deploy.explain.misfit import divergence, misfit
 from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
 from concent_warp.deploy.explain.pose_bias import PoseBias
@@ -129,6 +130,11 @@ FAR = np.full(8, 7.0)
         ({"misfit": FAR, "bias": bias(p=0.3), "diagnosis": named("joints", 0.2)}, "unexplained"),
         ({"misfit": FAR, "own": WEAK, "bias": bias(p=0.3)}, "policy"),
         ({"own": WEAK, "bias": bias()}, "policy"),
+        ({"rates": FailureRates(6, 48, 8, 96)}, "policy"),
+        ({"rates": FailureRates(6, 48, 3, 96)}, "unexplained"),
+        ({"rates": FailureRates(40, 60, 35, 96)}, "unexplained"),
+        ({"rates": FailureRates(2, 96, 0, 96)}, "unexplained"),
+        ({"rates": FailureRates(6, 48, 8, 96), "misfit": FAR}, "unexplained"),
     ],
 )  # fmt: skip
 def test_the_cause_follows_from_the_evidence(policy: cw.Policy, changes: dict[str, Any], cause: str) -> None:

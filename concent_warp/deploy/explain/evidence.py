@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from concent_warp.deploy.explain.cfg import JudgeCfg
+from concent_warp.deploy.explain.failure_rate import FailureRates
 from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.own_simulation import SimulatedTrials
 from concent_warp.deploy.explain.policy_evidence import limits_reached, unusual_observations
@@ -57,6 +58,8 @@ class Evidence:
     """The same of simulated trials."""
     difference: float | None = None
     """Largest difference of logged actions from those of the policy, asked again [-]; None without a log."""
+    rates: FailureRates | None = None
+    """How often the policy fails, where the replays agree while it succeeds in simulation from most starts."""
     bias: PoseBias | None = None
     """The error of tracked poses that explains most."""
     starts: tuple[MeasuredStart, ...] = ()
@@ -142,6 +145,10 @@ class Judge:
             return False
         return bool(np.median(evidence.explained(evidence.misfit_with_effect)) >= self._cfg.explained)
 
+    def fails_now_and_then(self, evidence: Evidence) -> bool:
+        """Return whether the policy fails about as often in its own simulation as in the trials."""
+        return evidence.rates is not None and evidence.rates.agree(self._cfg)
+
     def cause(self, evidence: Evidence) -> Cause:
         """Return the cause that all trials together show."""
         if evidence.own.rate <= self._cfg.weak_policy:
@@ -149,7 +156,7 @@ class Judge:
         if self.is_perception(evidence):
             return "perception"
         if not self.differs(evidence):
-            return "unexplained"
+            return "policy" if self.fails_now_and_then(evidence) else "unexplained"
         if self.is_perception_by_diagnosis(evidence):
             return "perception"
         return "physics" if self.is_physics(evidence) else "unexplained"
@@ -177,6 +184,8 @@ class Judge:
         return {
             "success in own simulation": evidence.own.rate,
             "success with the cause in it": None if evidence.with_cause is None else evidence.with_cause.rate,
+            "failure rate of the trials": None if (rates := evidence.rates) is None else rates.failed / rates.trials,
+            "failure rate in own simulation": None if rates is None else rates.simulated_failed / rates.simulated,
             "misfit": float(np.median(evidence.misfit)),
             "misfit of simulated trials": evidence.level,
             "misfit that agrees": self.limit(evidence),
@@ -198,6 +207,8 @@ class Judge:
             f"Replayed in the model, the trials are {numbers['misfit']:.1f} from their measurements (mean loss in "
             f"units of noise); simulated trials {evidence.level:.1f}, up to {self.limit(evidence):.1f} agrees.",
         ]
+        if evidence.rates is not None:
+            said.append(evidence.rates.sentence)
         if self.moves_otherwise(evidence):
             said.append(free_motion_sentence(numbers))
         if cause == "perception" and evidence.bias is not None and self.is_perception(evidence):
@@ -218,14 +229,17 @@ class Judge:
         trial, numbers = evidence.trials[k], self._trial_numbers(evidence, k)
         own: Cause = "unexplained"
         limit = self.limit(evidence)
+        now_and_then = cause == "policy" and bool(evidence.misfit[k] <= limit)
         if float(evidence.own.success[k].mean()) <= self._cfg.weak_policy:
-            own = "policy"
+            own, now_and_then = "policy", False
         elif cause == "perception" and (numbers["explained by perception"] or 0.0) >= self._cfg.least_gain:
             own = cause
         elif (numbers["explained by physics"] or 0.0) >= self._cfg.explained and (
             evidence.misfit[k] > (self._cfg.least_ratio * evidence.level if cause == "physics" else limit)
         ):
             own = "physics"
+        elif now_and_then and self.fails_now_and_then(evidence):
+            own = "policy"
         elif evidence.misfit[k] > limit and cause in ("physics", "perception"):
             own = cause  # what all trials show together; contacts may have gone another way in this replay
         usual = np.concatenate(list(evidence.usual_windows) or [np.ones(1)])
@@ -239,7 +253,7 @@ class Judge:
             cause=own,
             moment=moment,
             left_prediction=left,
-            sentence=trial_sentence(own, moment, left, numbers),
+            sentence=trial_sentence(own, moment, left, numbers, now_and_then=now_and_then),
             evidence=numbers,
             divergence=evidence.windows[k],
             threshold=threshold,

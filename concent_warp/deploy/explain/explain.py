@@ -14,6 +14,7 @@ from concent_warp.checks import check_settings
 from concent_warp.deploy.explain.cfg import ExplainCfg
 from concent_warp.deploy.explain.contact_windows import WindowSimulation
 from concent_warp.deploy.explain.evidence import Evidence, Judge
+from concent_warp.deploy.explain.failure_rate import FailureRates
 from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
 from concent_warp.deploy.explain.policy_evidence import other_action
@@ -133,6 +134,8 @@ class _Explaining:
             evidence = self._with_bias(evidence, judge, trials, others)
         if judge.differs(evidence) and cfg.diagnose and not judge.is_perception(evidence):
             evidence = self._with_diagnosis(evidence, judge, others)
+        if judge.cause(evidence) == "unexplained" and not judge.differs(evidence):
+            evidence = self._with_rates(evidence)
         evidence = self._with_cause_in_simulation(evidence, judge)
         progress(1.0, "done")
         total = sum(len(r.demonstrations) for r in self._recordings)
@@ -176,6 +179,18 @@ class _Explaining:
         size = ObservationLayout.of(self._own.task, cfg).size * cfg.history
         found = [other_action(act, size, t.demonstration) for t in trials]
         return max((one for one in found if one is not None), default=None)
+
+    def _with_rates(self, evidence: Evidence) -> Evidence:
+        """Count how often the policy fails in its own simulation from starts of trials that are drawn from all."""
+        every = [d for r in self._recordings for d in r.demonstrations]
+        if self._failed == len(every):  # nothing is known of how often it fails
+            return evidence
+        count = min(self._cfg.rate_trials, len(every))
+        drawn = np.random.default_rng(self._cfg.seed).permutation(len(every))[:count]
+        starts = [t.start for t in self._preparation.usable([every[k] for k in sorted(drawn)])]
+        found = self._simulate(starts, 0.8, 0.95).success
+        rates = FailureRates(self._failed, len(every), int((~found).sum()), found.size)
+        return replace(evidence, rates=rates)
 
     def _with_bias(
         self, evidence: Evidence, judge: Judge, trials: list[PreparedTrial], others: list[PreparedTrial]

@@ -14,7 +14,14 @@ ANOTHER_POLICY = 0.05
 """Difference of logged actions from those of the policy, asked again, from which on it is another one [-]."""
 
 
-def trial_sentence(cause: Cause, moment: float | None, left: float | None, numbers: Mapping[str, float | None]) -> str:
+def trial_sentence(
+    cause: Cause,
+    moment: float | None,
+    left: float | None,
+    numbers: Mapping[str, float | None],
+    *,
+    now_and_then: bool = False,
+) -> str:
     """Return a sentence on one trial.
 
     Args:
@@ -22,11 +29,14 @@ def trial_sentence(cause: Cause, moment: float | None, left: float | None, numbe
         moment: When model and measurement part, or the object stops to come nearer to its place [s].
         left: When the object leaves the band of simulated episodes [s].
         numbers: Evidence by name.
+        now_and_then: Whether the policy fails in its own simulation too, but not from this start.
     """
     outside = "" if left is None else f"; outside the band of simulated episodes from {left:.2f} s on"
     success = f"{numbers['success in own simulation']:.0%} of simulated episodes from its start succeed"
     if cause == "policy":
         stalled = "" if moment is None else f"; no progress after {moment:.2f} s"
+        if now_and_then:
+            return f"The policy fails now and then in its own simulation too, and the replay agrees: {success}."
         limits = f"the lead of the commands at its limit in {numbers['lead at limit']:.0%} of the steps"
         return f"The policy fails in its own simulation too: {success}{stalled}; {limits}{outside}."
     if cause == "unexplained":

@@ -9,7 +9,15 @@ import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
-from concent_warp.effects.select import BEARINGS, SINGLE, dof_of, dofs_of, joints_by_type, servo_stiffness, typical_torque
+from concent_warp.effects.select import (
+    BEARINGS,
+    SINGLE,
+    dof_of,
+    dofs_of,
+    joints_by_type,
+    servo_stiffness,
+    typical_torque,
+)
 from concent_warp.scene.holding import FRICTION_IMPEDANCE, TIME_CONSTANT_STEPS
 
 if TYPE_CHECKING:
