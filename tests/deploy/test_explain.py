@@ -195,3 +195,20 @@ def test_a_trial_without_tracked_poses_is_refused(
     recording = Recording(policy.run.model.scene.xml, (replace(trial, measured=measured),), "blind")
     with pytest.raises(cw.RecordingError, match="manipulated object was not tracked"):
         cw.explain(policy, recording)
+
+
+def test_a_trial_that_agrees_is_the_policys_where_that_fails_from_the_other_starts(
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
+) -> None:
+    trials = prepared[1]
+    success = np.array([[False] * 4, [True] * 4])
+    own = SimulatedTrials(success, Recording("", ()), {k: np.zeros((400, 3)) for k in range(8)})
+    windows = [np.ones(8)] * 2
+    of_both = evidence(trials=trials, own=own, misfit=np.ones(2), windows=windows, usual_windows=windows)
+    found = Judge(policy, policy.run.task(), JudgeCfg()).explanation(of_both, ["a", "b"], 2, 2)
+    assert [t.cause for t in found.trials] == ["policy", "policy"]
+    assert "fails in its own simulation too" in found.trials[0].sentence
+    assert "now and then" in found.trials[1].sentence
+    differing = replace(of_both, misfit=np.array([1.0, 9.0]))
+    found = Judge(policy, policy.run.task(), JudgeCfg()).explanation(differing, ["a", "b"], 2, 2)
+    assert [t.cause for t in found.trials] == ["policy", "unexplained"]

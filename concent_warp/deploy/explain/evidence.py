@@ -238,8 +238,8 @@ class Judge:
             evidence.misfit[k] > (self._cfg.least_ratio * evidence.level if cause == "physics" else limit)
         ):
             own = "physics"
-        elif now_and_then and self.fails_now_and_then(evidence):
-            own = "policy"
+        elif now_and_then:
+            own = cause  # what all trials show together; the few episodes from one start tell less
         elif evidence.misfit[k] > limit and cause in ("physics", "perception"):
             own = cause  # what all trials show together; contacts may have gone another way in this replay
         usual = np.concatenate(list(evidence.usual_windows) or [np.ones(1)])
