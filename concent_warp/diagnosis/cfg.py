@@ -354,7 +354,9 @@ class DiagnoseCfg:
     """RMS residual over noise up to which it may [-]; beyond it too much is left to say what is missing. Empirical."""
     max_remainder: Share = 0.15
     """Share of such a remainder that a further effect may leave, if it is to be named all the same [-]: one that is
-    missing explains nearly all of it, one that takes up an error in a formula a part. Empirical."""
+    missing explains nearly all of it, one that takes up an error in a formula a part. Of several effects that
+    leave more than noise each may leave no more of what is left without it, or they do not explain the data. Empirical.
+    """
     max_typical_sizes: Positive = 30.0
     """Size of a parameter over its typical size, from which on an effect is not accepted where what it explains is less
     than `max_form_error` of the first discrepancy [-]: 2 % of the Cauchy prior of sizes lie beyond. Of so small a

@@ -385,7 +385,8 @@ class Procedure:
         added = any(f.accepted for f in record.findings)
         share = float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0))
         unexplained = share if added or begun.ratio > cfg.adequate_ratio else 0.0
-        adequate, form_error = context.explains(last, begun, added=added), None
+        adequate = context.explains(last, begun, added=added) and not context.takes_up_parts(last)
+        form_error = None
         if added and is_lacking(last, context.noise_factors, cfg) and context.is_form_error(last, begun):
             form_error = unexplained
         unknown = None

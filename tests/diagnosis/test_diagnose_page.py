@@ -76,6 +76,7 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     small, ratio = 100 * cfg.small_form_error, cfg.small_form_error_ratio
     assert f"or less than {small:.0f} % and at most {ratio:g} x noise" in PAGE
     assert f"leaves at most {rest:.0f} % of that remainder" in PAGE
+    assert f"one of several that leaves more than {rest:.0f} % of what is left without it" in PAGE
     assert cfg.search.reconsidered == 5
     assert "up to five that removed at least half as much" in PAGE
     assert cfg.search.restart_min_gain == 0.5

@@ -235,9 +235,9 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     made, added = procedure(), bool(groups) or unknown is not None
     made.record.groups = groups
     made.record.findings = [
-        finding("late", 0.1, accepted=added, step=1), finding("no", 0.9, accepted=False),
-        finding("first", 0.2, accepted=added), finding("less", 0.8, accepted=False),
-        finding("later", 0.95, accepted=False, step=1),
+        finding("late", 0.95, accepted=added, step=1), finding("no", 0.98, accepted=False),
+        finding("first", 0.96, accepted=added), finding("less", 0.97, accepted=False),
+        finding("later", 0.96, accepted=False, step=1),
     ]  # fmt: skip
     # A share below zero stands for an error of form.
     force = None if unknown is None else SimpleNamespace(share=abs(unknown), form_error=unknown < 0)
@@ -257,6 +257,26 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     # Where much more than noise is left, no force of unknown form is needed to show that something is missing.
     tested = ratios[-1] <= 1.1 or ratios == (5.0, 1.3) or form_error
     assert found.unknown_force is (force if tested else None)
+
+
+@pytest.mark.parametrize(
+    ("gains", "ratio", "verdict"),
+    [
+        ((0.97, 0.9), 1.45, "effect"),  # 6 % of what is left without the second one
+        ((0.97, 0.7), 1.45, "none_of_these"),  # 18 %
+        ((0.7, 0.97), 1.45, "none_of_these"),
+        ((0.97, 0.06), 1.05, "effect"),  # little more than noise
+        ((0.7,), 1.45, "effect"),  # a single one is compared with the model as given
+    ],
+)
+def test_of_several_effects_none_leaves_a_part_of_what_is_left_without_it(monkeypatch, gains, ratio, verdict):
+    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    made = procedure()
+    made.record.findings = [finding(str(k), gain, step=k) for k, gain in enumerate(gains)]
+    made.record.groups = [(f.name,) for f in made.record.findings]
+    given = node(12.0)
+    fitted = [given, *(node(ratio, effects=1 + k) for k in range(len(gains)))]
+    assert made.conclude(given, fitted, (), ()).verdict == verdict
 
 
 def test_what_is_left_is_no_error_of_form_where_no_effect_was_accepted(monkeypatch):

@@ -98,6 +98,21 @@ class SearchContext:
         little = least_ratio(one, self.noise_factors) <= self.cfg.search.explained_ratio
         return (adequate and little) or self.is_form_error(one, first)
 
+    def takes_up_parts(self, last: FittedModel) -> bool:
+        """Return whether one of several accepted effects leaves too large a part of what is left without it.
+
+        Where more than noise is left, an effect that is missing explains nearly all of what the others leave, one that
+        stands in for what the library lacks a part, see `DiagnoseCfg.max_remainder`.
+
+        Args:
+            last: The fitted model with all of them.
+        """
+        gains = [f.gain for f in self.record.accepted()]
+        if len(gains) < 2 or least_ratio(last, self.noise_factors) <= self.cfg.search.explained_ratio:
+            return False
+        without = last.ratio**2 / max(1 - min(gains), 1e-12)
+        return last.ratio**2 - 1 > self.cfg.max_remainder * (without - 1)
+
     def nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None = None) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
 
