@@ -184,8 +184,8 @@ class Procedure:
 
         A single one that leaves no more than noise stands, unless it is one of objects, which act through their
         contacts as laws of these do, or is small, or is none of contacts where such errors alone bring what is left
-        down to noise. Several do not where one is of objects, or where they leave more than noise: each was chosen beside
-        the others, and then all may be wrong.
+        down to noise. Several do not where one is of objects, or where they leave more than noise: each was chosen
+        beside the others, and then all may be wrong.
 
         Args:
             given: The model as given.

@@ -52,8 +52,8 @@ class GravityTilt(Effect):
 
 
 AIR_DENSITIES = (0.6, 2.0, 10.0)
-"""Densities that are scanned [kg/m^3], from that of air, 1.2, times half the drag coefficient of a sphere, 0.47, upward:
-a light ball that stops in the air within its flight is followed from there only."""
+"""Densities that are scanned [kg/m^3], upward from that of air times a sphere's drag coefficient, 1.2 x 0.47: a light
+ball that stops in the air within its flight is followed from there only."""
 
 
 class AirEffect(Effect):
