@@ -183,8 +183,9 @@ class Procedure:
         """Return whether the effects that were added stand beside errors of impacts.
 
         A single one that leaves no more than noise stands, unless it is one of objects, which act through their
-        contacts as laws of these do, or is small. Several do not where one is of objects, or where they leave more than
-        noise: each was chosen beside the others, and then all may be wrong.
+        contacts as laws of these do, or is small, or is none of contacts where such errors alone bring what is left
+        down to noise. Several do not where one is of objects, or where they leave more than noise: each was chosen
+        beside the others, and then all may be wrong.
 
         Args:
             given: The model as given.
@@ -194,7 +195,10 @@ class Procedure:
         context, accepted = self.context, self.record.accepted()
         near_noise = least_ratio(fitted[-1], context.noise_factors) <= context.cfg.search.explained_ratio
         plain = near_noise and all(f.family != "objects" for f in accepted)
-        if len(accepted) == 1 and plain and not self._is_small(given):
+        least, most = (least_ratio(one, context.noise_factors) for one in (rough, given))
+        alone = least <= context.cfg.search.explained_ratio < most
+        doubtful = self._is_small(given) or (alone and accepted[0].family != "contact")
+        if len(accepted) == 1 and plain and not doubtful:
             return True
         if len(accepted) > 1 and not plain:
             return False

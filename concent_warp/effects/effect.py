@@ -126,7 +126,7 @@ class Effect:
     step_error: ClassVar[float] = 0.0
     """Standard deviation of its values due to the model's time step, over the step [-]. Part of the intervals."""
     part_of: ClassVar[str] = ""
-    """Name of the effect that is the same quantity without a tolerance, for a nominal value."""
+    """Name of the effect that is the same quantity without a tolerance, for a nominal value; see `is_within`."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
     nominal: ClassVar[bool] = False
@@ -148,7 +148,7 @@ class Effect:
 
     @classmethod
     def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:  # noqa: ARG003
-        """Return the single elements that are candidates of their own beside `targets`, each a selection.
+        """Return further selections that are candidates of their own beside `targets`: single elements, or parts.
 
         None by default. An effect that has one value for all elements of a selection may act on one of them alone.
         """
@@ -208,6 +208,11 @@ class Effect:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the true state of which the instruments show `qpos` (nq,) and `qvel` (nv,), apart from `true_time`."""
         return qpos, qvel
+
+    @classmethod
+    def is_within(cls, other: Effect) -> bool:
+        """Return whether another effect is the same quantity without a tolerance, for a nominal value."""
+        return bool(cls.part_of) and other.name == cls.part_of
 
     def has_as_special_case(self, other: Effect) -> bool:
         """Return whether another effect of fewer parameters equals this one at some of its values."""
@@ -285,11 +290,11 @@ class Effect:
     def parameter_per_target(
         self, name: str, unit: str, null: Sequence[float] | np.ndarray | float, **rest: float
     ) -> tuple[Parameter, ...]:
-        """Return one parameter a target; `rest` are the other entries of `Parameter`."""
-        values = np.broadcast_to(np.asarray(null, dtype=float), (len(self.target),))
+        """Return one parameter an element; `rest` are the other entries of `Parameter`."""
+        values = np.broadcast_to(np.asarray(null, dtype=float), (len(self.elements),))
         return tuple(
             Parameter(f"{name}[{t}]", unit, float(v), **rest)  # pyright: ignore[reportArgumentType]
-            for t, v in zip(self.target, values, strict=True)
+            for t, v in zip(self.elements, values, strict=True)
         )
 
 

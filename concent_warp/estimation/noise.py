@@ -44,6 +44,12 @@ EVEN = 1e-6
 """Deviation of the weights of differences from those for even steps that is rounding [-]."""
 
 
+SAME = 1e-6
+"""Differences over their scale that are rounding [-]."""
+MAX_CLIPPINGS = 20
+"""Steps after which the scale of the smallest differences is settled."""
+
+
 @dataclass(frozen=True)
 class NoiseCfg:
     """Settings of the estimation of noise."""
@@ -64,6 +70,11 @@ class NoiseCfg:
     max_share: Share = 0.05
     """Share of the standard deviation of a channel up to which differences over more than one sample may be noise [-]:
     differences over a good part of a period of the motion grow no more, and are no noise."""
+    max_outer_scale: Factor = 3.0
+    """Scale of the median difference over that of the smallest ones [-], above which most differences are not noise
+    but motion in steps, as of a stiff servo behind coarse set-points. Of noise alone it is 1."""
+    clip: Factor = 3.0
+    """Standard deviations up to which differences belong to the smallest ones [-]."""
     rounding: float = 1e-9
     """Scatter below this share of the largest reading is rounding, as of simulated readings without noise [-]."""
 
@@ -129,8 +140,8 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
     if sum(len(piece) for piece in pieces) < cfg.min_readings:
         return Noise(np.nan, "unknown")
     floor = 0.0 if kind == "orientation" else _resolution(pieces) / np.sqrt(12)
-    found = _noise_in_differences(timed, kind, cfg)
-    fast = _difference_std(timed, kind, 1)
+    found = _noise_in_differences(timed, kind, floor, cfg)
+    fast = _difference_std(timed, kind, 1, floor, cfg)
     if (rest := _rest_std(pieces, kind, max(fast, floor), cfg)) is not None:
         scatter, freedom = rest
         std, error = max(scatter, fast), 2 / np.sqrt(2 * freedom)
@@ -174,14 +185,16 @@ def _finite_pieces(channel: Channel) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(channel.time[rows], value[rows]) for rows in parts if len(rows) and bool(valid[rows].all())]
 
 
-def _noise_in_differences(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, cfg: NoiseCfg) -> Noise:
+def _noise_in_differences(
+    timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, floor: float, cfg: NoiseCfg
+) -> Noise:
     """Return the noise per component seen in third differences over several lags.
 
     Of two lags h and 2 h, noise s and smooth motion m h^3 leave s^2 = (64 v(h) - v(2 h)) / 63 of the variances v.
     """
     pieces = [piece for _, piece in timed]
     lags = [h for h in cfg.lags if sum(max(len(piece) - 3 * h, 0) for piece in pieces) >= cfg.min_readings]
-    values = [_difference_std(timed, kind, h) for h in lags or cfg.lags[:1]]
+    values = [_difference_std(timed, kind, h, floor, cfg) for h in lags or cfg.lags[:1]]
     std, low, high = values[0], 0.0, values[0]
     most = cfg.max_share * _spread(pieces, kind)
     for k, (near, far) in enumerate(pairwise(values)):
@@ -198,10 +211,13 @@ def _spread(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     return float(np.sqrt(np.mean(centred**2)))
 
 
-def _difference_std(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, lag: int) -> float:
+def _difference_std(
+    timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, lag: int, floor: float, cfg: NoiseCfg
+) -> float:
     """Return the noise per component seen in third differences, by their median size, so that impacts count little.
 
-    Of orientations the first difference is the rotation vector from one reading to a later one.
+    Of orientations the first difference is the rotation vector from one reading to a later one. No noise is below
+    `floor`, what the resolution leaves.
     """
     third = []
     for time, piece in timed:
@@ -215,8 +231,27 @@ def _difference_std(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, 
             third.append(after * first[2 * lag :] + middle * first[lag:-lag] + before * first[: -2 * lag])
     if not third:
         return np.nan
-    spread = np.median(np.abs(np.concatenate(third)), axis=0) / 0.67449
+    spread = np.array([_inner_scale(column, np.sqrt(20) * floor, cfg) for column in np.abs(np.concatenate(third)).T])
     return float(np.sqrt(np.mean(spread**2) / 20))
+
+
+def _inner_scale(sizes: np.ndarray, floor: float, cfg: NoiseCfg) -> float:
+    """Return the standard deviation of a normal distribution by the sizes of differences, shape (n,), by their median.
+
+    Where the smallest are far smaller than belongs to such a median, it is that of these: their root mean square, of
+    all that are within `NoiseCfg.clip` of it.
+    """
+    inner, outer = (float(np.quantile(sizes, q)) / z for q, z in ((0.1, 0.12566), (0.5, 0.67449)))
+    apart = sizes[sizes > SAME * outer]
+    # Readings that come in steps differ by none, or by one of these at least.
+    floor = max(floor, float(np.quantile(apart, 0.05)) if len(apart) else 0.0)
+    scale = max(inner, floor)
+    for _ in range(MAX_CLIPPINGS):
+        within = sizes[sizes <= cfg.clip * scale]
+        before, scale = scale, max(float(np.sqrt(np.mean(within**2))), floor)
+        if scale >= (1 - 1e-3) * before:
+            break
+    return scale if outer > cfg.max_outer_scale * scale else outer
 
 
 def _weights(time: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

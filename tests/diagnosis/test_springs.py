@@ -59,13 +59,13 @@ def door(stiffness: float, preload: float, damping: float = 0.6) -> Recording:
     return recorded(DOOR, "hand", pushes, lambda q, v, u: u - damping * v - stiffness * q + preload, DOOR_INERTIA, 1)
 
 
-def arm(stiffness: float = 0.0, share: float = 0.0, gain: float = 1.0, reach: float = 0.8) -> Recording:
-    """Return an arm that swings; a share of its weight is held up."""
+def arm(stiffness: float = 0.0, share: float = 0.0, kp: float = 1.0, kv: float = 1.0, reach: float = 0.8) -> Recording:
+    """Return an arm that swings; a share of its weight is held up, and the servo's gains are off by factors."""
     time = np.arange(0, 4, PERIOD)
     command = reach * (0.6 * np.sin(2.2 * time) + 0.4 * np.sin(5 * time))
 
     def torque(q: float, v: float, u: float) -> float:
-        return gain * (12 * (u - q) - 0.8 * v) - 0.05 * v - stiffness * q - (1 - share) * WEIGHT * np.sin(q)
+        return kp * 12 * (u - q) - kv * 0.8 * v - 0.05 * v - stiffness * q - (1 - share) * WEIGHT * np.sin(q)
 
     return recorded(ARM, "servo", command, torque, ARM_INERTIA, 2)
 
@@ -99,7 +99,10 @@ def test_a_door_without_a_spring_needs_none_and_damping_stays_damping():
     [
         ({"stiffness": 2.2}, "joint_stiffness"),
         ({"share": 0.3}, "gravity_compensation"),
-        ({"gain": 0.8}, "actuator_gain"),
+        ({"kp": 0.8, "kv": 0.8}, "actuator_gain(servo)"),
+        ({"kp": 0.75}, "actuator_gain(servo, kp)"),
+        ({"kv": 0.7}, "actuator_gain(servo, kv)"),
+        ({"kv": 1.3}, "joint_damping"),
     ],
 )
 def test_wide_swings_tell_a_spring_from_weight_and_gain(changes, name):

@@ -12,6 +12,7 @@ from concent_warp.effects.library.drives import (
     GripForce,
     JointCompliance,
 )
+from concent_warp.errors import ModelError
 
 MASS, KP = 2.0, 400.0
 CART = SLIDER.format(joint="", actuator=MOTOR)
@@ -27,6 +28,36 @@ def test_gain_scales_what_a_motor_does_and_how_far_a_servo_sags():
     )
     sag = move(world(WEIGHT, ActuatorGain("drive"), 0.7), 3.0, ctrl=0.1).qpos[-1, 0] - 0.1
     assert sag == pytest.approx(-LOAD / (0.7 * KP), rel=1e-4)
+
+
+@pytest.mark.parametrize(("part", "kp", "kv"), [("kp", 0.7, 1.0), ("kv", 1.0, 0.7)])
+def test_one_gain_of_a_servo_is_scaled_and_nothing_else(part, kp, kv):
+    plain, changed = world(SERVO).compile(), world(SERVO, ActuatorGain("drive", part), 0.7).compile()
+    assert changed.actuator_gainprm[0, 0] == pytest.approx(kp * KP)
+    np.testing.assert_allclose(changed.actuator_biasprm[0, :3], [0, -kp * KP, -kv * 40])
+    (parameter,) = ActuatorGain("drive", part).parameters(plain)
+    assert parameter.name == f"{part}[drive]"
+
+
+def test_single_gains_are_candidates_of_servos_that_have_both():
+    assert ActuatorGain.targets(world(SERVO).compile()) == (("drive",),)
+    assert ActuatorGain.single_targets(world(SERVO).compile()) == (("drive", "kp"), ("drive", "kv"))
+    for xml in (CART, SERVO.replace(' kv="40"', "")):
+        assert ActuatorGain.single_targets(world(xml).compile()) == ()
+    with pytest.raises(ModelError, match="position servos that have both gains"):
+        world(CART, ActuatorGain("drive", "kp"), 0.7)
+
+
+def test_one_gain_of_a_gripper_leaves_the_limit_of_its_force():
+    xml = GRIPPER.replace("<motor", '<position kp="100" kv="5" forcerange="-9 9"')
+    fingers = ("left", "right")
+    assert {names[-1] for names in GripForce.single_targets(world(xml).compile())} == {"kp", "kv"}
+    plain, changed = world(xml).compile(), world(xml, GripForce(*fingers, "kp"), 0.5).compile()
+    for name in ("actuator_forcerange", "actuator_biasprm"):
+        of = getattr(plain, name).copy()
+        if name == "actuator_biasprm":
+            of[[plain.actuator(n).id for n in fingers], 1] *= 0.5
+        np.testing.assert_allclose(getattr(changed, name), of)
 
 
 def test_saturated_drive_accelerates_by_its_limit():

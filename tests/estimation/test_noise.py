@@ -183,3 +183,31 @@ def test_uneven_steps_of_a_clock_are_no_noise(kind):
     assert channel_noise(Channel(time, value), kind).std == pytest.approx(STD, rel=0.1)
     even = channel_noise(Channel(np.arange(858) * 0.007, value), kind)
     assert even.std > 2 * STD
+
+
+def steps(noise: float, resolution: float = 0.0) -> np.ndarray:
+    """Return readings, shape (300, 1), of a stiff servo behind set-points in steps of 10 mm, which it overshoots."""
+    rng, value = np.random.default_rng(3), []
+    for target in 0.01 * rng.integers(0, 20, 60):
+        start = value[-1] if value else 0.0
+        value += [target + 0.6 * (target - start), *[target] * int(rng.integers(2, 9))]
+    read = np.array(value[:300])[:, None] + noise * rng.normal(size=(300, 1))
+    return np.round(read / resolution) * resolution if resolution else read
+
+
+@pytest.mark.parametrize(("noise", "resolution"), [(2e-5, 0.0), (2e-5, 1e-5), (5e-5, 5e-5)])
+def test_set_points_in_steps_that_are_followed_stiffly_are_no_noise(noise, resolution):
+    found = channel_noise(Channel(0.04 * np.arange(300), steps(noise, resolution)), "joint")
+    assert noise < 2 * found.std
+    assert found.std < 2 * noise
+    assert found.low < noise
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.5, 1.0, 1.5, 3.0])
+def test_noise_of_a_smooth_motion_is_read_by_the_median_whatever_the_resolution(resolution):
+    time, rng = 0.01 * np.arange(600), np.random.default_rng(4)
+    read = np.sin(time)[:, None] + 1e-3 * rng.normal(size=(600, 1))
+    if resolution:
+        read = np.round(read / (1e-3 * resolution)) * 1e-3 * resolution
+    found = channel_noise(Channel(time, read), "joint")
+    assert found.std == pytest.approx(1e-3 * np.sqrt(1 + resolution**2 / 12), rel=0.35)

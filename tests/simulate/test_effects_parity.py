@@ -8,6 +8,7 @@ import pytest
 
 from concent_warp.effects.effect import Effect, Parameter, variant_fields
 from concent_warp.effects.force_model import ForceModel
+from concent_warp.effects.library.drives import GAINS
 from concent_warp.effects.library.objects import AXES
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import EngineError
@@ -71,7 +72,8 @@ def typical(effect: Effect, m) -> list[float]:
 def on_every_target(model: Model, names: Sequence[str], part: str = "") -> list[Effect]:
     """Return effects that fields, force models and commands can express, on each target or on a part of each."""
     m = model.compile()
-    found = [cls(*target) for name in names for cls in [effect_classes()[name]] for target in cls.targets(m)]
+    kinds = [effect_classes()[name] for name in names]
+    found = [cls(*t) for cls in kinds for t in (*cls.targets(m), *(cls.single_targets(m) if part else ()))]
     return [e for e in found if not e.edits and (e.target[-1] if e.is_part else "") == part]
 
 
@@ -132,6 +134,11 @@ def test_air_changes_the_motion_alike_on_both_engines():
 @pytest.mark.parametrize("part", AXES)
 def test_single_moments_of_inertia_change_the_motion_alike_on_both_engines(part):
     assert_parity(*all_at_once("cpu", ("inertia",), part))
+
+
+@pytest.mark.parametrize("part", GAINS)
+def test_single_gains_change_the_motion_alike_on_both_engines(part):
+    assert_parity(*all_at_once("cpu", ("actuator_gain",), part))
 
 
 @pytest.mark.gpu

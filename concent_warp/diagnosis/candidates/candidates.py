@@ -49,4 +49,5 @@ def label(effect: Effect, among: Sequence[Effect]) -> str:
         return effect.name
     if len(effect.elements) == 1:
         return f"{effect.name}({', '.join(effect.target)})"
-    return f"{effect.name}({effect.target[0]}, ...)"
+    of = f"{effect.target[0]}, ..."
+    return f"{effect.name}({of}, {effect.part})" if effect.part else f"{effect.name}({of})"

@@ -146,7 +146,7 @@ def nominal_errors(
     Determination", 2004, chapter 6). Errors d have their tolerance as a prior, and change the residuals, the parameters
     adapted, by no more than what the model leaves beyond the noise, or than what counts as noise still
     (`DiagnoseCfg.min_gain`): larger ones would show. Those that were fitted are known no better than that, as what is
-    left may be the error of a formula. Left out are those that an effect of the model stands for (`Effect.part_of`).
+    left may be the error of a formula. Left out are those that an effect of the model stands for (`Effect.is_within`).
 
     Args:
         last: The fitted model.
@@ -188,7 +188,7 @@ def possible_nominal_effects(model: Model) -> list[Effect]:
     """Return all nominal values of a model as effects, less those that an effect of the model is."""
     compiled, found = model.compile(), []
     for kind in NOMINAL:
-        taken = {t for a in model.effects if a.effect.name == kind.part_of for t in a.effect.target}
+        taken = {t for a in model.effects if kind.is_within(a.effect) for t in a.effect.target}
         for targets in kind.targets(compiled):
             if names := [t for t in targets if t not in taken]:
                 found.append(kind(*names))

@@ -49,9 +49,14 @@ class Revision:
         """Whether there was no time for what errors of nominal values do to the intervals of the answer."""
 
     def simplified(self, fitted: list[FittedModel]) -> list[FittedModel]:
-        """Return the fitted models without superfluous effects, and without one that takes up errors of formulas."""
+        """Return the fitted models without superfluous effects, and without one that takes up errors of formulas.
+
+        Where no effect is left, it is one model: with nominal values in their place, or the first.
+        """
         record = self.context.record
         found, provisional = self.remove_superfluous(self.reconsidered(fitted)), record.provisional
+        if len(found) > 1 and not record.accepted():
+            return found[-1:] if _is_other(found) else found[:1]
         if len(found) > len(fitted) or provisional is None or len(fitted) <= provisional + 1:
             return found
         before, after = fitted[provisional], fitted[provisional + 1]
@@ -96,9 +101,8 @@ class Revision:
         """
         context, record = self.context, self.context.record
         steps = list(range(len(fitted) - 1))
-        # A shorter time step, or nominal values, may have made the last one superfluous too.
-        untested = 0 if _is_other(fitted) else 1
-        while len(steps) > untested:
+        # A shorter time step, or nominal values in place of another one, may have made the last one superfluous too.
+        while len(steps) > (untested := 0 if _is_other(fitted) else 1):
             last = fitted[-1]
             owned = len(last.model.effects) - len(steps)
             context.progress("removing one effect at a time")

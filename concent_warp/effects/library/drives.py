@@ -10,7 +10,7 @@ import numpy as np
 from concent_warp.effects.effect import PHASE_ERROR, Effect, Parameter, Reader
 from concent_warp.effects.library.elastic_forces import SLOTS, ElasticGearForce
 from concent_warp.effects.library.gear_forces import BacklashForce
-from concent_warp.effects.library.joints import MUJOCO
+from concent_warp.effects.library.joints import MUJOCO, JointDamping
 from concent_warp.effects.select import (
     SINGLE,
     arm_actuators,
@@ -43,6 +43,10 @@ OF_ACTUATOR = {
 }
 """Those of an actuator."""
 
+KP, KV = GAINS = ("kp", "kv")
+"""The two gains of a position servo, as parts of a drive of which one alone is off."""
+PART_RARITY = 4.0
+"""Rarity of an error of one of them alone (`Effect.rarity`): a setting is wrong, not the drive's strength."""
 GRIP_FACTORS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
 """Factors on the grip force that are scanned [-]: the object slips only in a narrow range of them."""
 
@@ -84,27 +88,65 @@ class ServoEffect(DriveEffect):
 
 
 class ActuatorGain(DriveEffect):
-    """Another gain of an actuator."""
+    """Another gain of an actuator.
+
+    The target is actuators, or position servos with velocity feedback and one of `GAINS`, which alone is off.
+    """
 
     name = "actuator_gain"
-    summary = "The drive's force is the model's times a factor, feedback included."
+    summary = (
+        "The drive's force is the model's times a factor, feedback included. Or, by a last target, kp or kv: the"
+        " position or the velocity gain alone is, of servos that have both."
+    )
     source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
     signature = "residual torque in proportion to the commanded one; more or less sag under load"
     confusions = ("joint_compliance", "gravity_compensation", "load_friction", "mass")
+    requirement = f"{DriveEffect.requirement}; with kp or kv position servos that have both gains"
+    parts = GAINS
+
+    def __init__(self, *target: str) -> None:
+        super().__init__(*target)
+        if self.part:
+            self.rarity = PART_RARITY  # pyright: ignore[reportAttributeAccessIssue]
+
+    def has_as_special_case(self, other: Effect) -> bool:
+        """Return whether a damping of joints is what more velocity feedback is."""
+        return super().has_as_special_case(other) or (self.part == KV and other.name == JointDamping.name)
+
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the actuator drives a joint, and has two gains where one of them is off."""
+        return super().applies_to(m, i) and (not self.part or has_both_gains(m, i))
+
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the actuators that have two gains with each of `GAINS`."""
+        both = [tuple(n for n in names if has_both_gains(m, m.actuator(n).id)) for names in cls.targets(m)]
+        return tuple((*names, part) for names in both if names for part in cls.parts)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor for each actuator."""
-        return self.parameter_per_target("gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
+        return self.parameter_per_target(self.part or "gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Gain and bias."""
-        return ("actuator_gainprm", "actuator_biasprm")
+        return ("actuator_biasprm",) if self.part == KV else ("actuator_gainprm", "actuator_biasprm")
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Scale gain and bias."""
+        """Scale gain and bias, or what of them belongs to one gain of the servo."""
         ids = self.ids(m)
-        m.actuator_gainprm[ids, :3] *= values[:, None]
-        m.actuator_biasprm[ids, :3] *= values[:, None]
+        if self.part == KV:
+            m.actuator_biasprm[ids, 2] *= values
+        elif self.part == KP:
+            m.actuator_gainprm[ids, 0] *= values
+            m.actuator_biasprm[ids, 1] *= values
+        else:
+            m.actuator_gainprm[ids, :3] *= values[:, None]
+            m.actuator_biasprm[ids, :3] *= values[:, None]
+
+
+def has_both_gains(m: mujoco.MjModel, actuator: int) -> bool:
+    """Return whether an actuator is a position servo with velocity feedback."""
+    return servo_gain(m, actuator) > 0 and bool(m.actuator_biasprm[actuator, 2])
 
 
 class GripForce(ActuatorGain):
@@ -112,7 +154,10 @@ class GripForce(ActuatorGain):
 
     name = "grip_force"
     family = "contact"
-    summary = "The gripper's force is the model's times a factor."
+    summary = (
+        "The gripper's force is the model's times a factor. Or, by a last target, kp or kv: the position or the"
+        " velocity gain alone is, of a servo that has both."
+    )
     source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
     signature = "the grasped object slips or does not; fingers close slower or faster"
     confusions = ("pad_friction", "mass")
@@ -125,16 +170,17 @@ class GripForce(ActuatorGain):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor for all."""
-        return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=GRIP_FACTORS),)
+        return (Parameter(self.part or "gain", "-", 1.0, 0.02, 10.0, 0.3, scan=GRIP_FACTORS),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
-        """Gain, bias and limit of the force."""
-        return (*super().fields(m), "actuator_forcerange")
+        """Gain, bias and limit of the force, which one gain of the servo leaves as it is."""
+        return super().fields(m) if self.part else (*super().fields(m), "actuator_forcerange")
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Scale gain, bias and limits."""
-        super().write(m, np.broadcast_to(values, (len(self.target),)))
-        m.actuator_forcerange[self.ids(m)] *= values
+        super().write(m, np.broadcast_to(values, (len(self.elements),)))
+        if not self.part:
+            m.actuator_forcerange[self.ids(m)] *= values
 
 
 class ActuatorSaturation(DriveEffect):

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter, Reader
-from concent_warp.effects.library.drives import ActuatorGain
+from concent_warp.effects.library.drives import KV, ActuatorGain
 from concent_warp.effects.library.joints import JointEffect
 from concent_warp.effects.library.measurement import MeasurementEffect
 from concent_warp.effects.library.objects import Size, mass_fields
@@ -172,6 +172,12 @@ class NominalGain(ActuatorGain):
     summary = "The drive's force is the model's times a factor within the tolerance of nominal values."
     confusions = ("actuator_gain",)
     part_of = "actuator_gain"
+    parts = ()
+
+    @classmethod
+    def is_within(cls, other: Effect) -> bool:
+        """Return whether another effect is the gains of actuators, or their position gains."""
+        return super().is_within(other) and other.part != KV
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor an actuator."""
@@ -185,6 +191,12 @@ class NominalVelocityGain(ActuatorGain):
     nominal = True
     summary = "The drive's velocity feedback is the model's times a factor within the tolerance of nominal values."
     confusions = ("joint_damping", "latency")
+    parts = ()
+
+    @classmethod
+    def is_within(cls, other: Effect) -> bool:
+        """Return whether another effect is the velocity gains of actuators."""
+        return other.name == ActuatorGain.name and other.part == KV
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:

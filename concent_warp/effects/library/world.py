@@ -51,6 +51,11 @@ class GravityTilt(Effect):
         m.opt.gravity = Rotation.from_rotvec([values[0], values[1], 0.0]).apply(m.opt.gravity)
 
 
+AIR_DENSITIES = (0.6, 2.0, 10.0)
+"""Densities that are scanned [kg/m^3], upward from that of air times a sphere's drag coefficient, 1.2 x 0.47: a light
+ball that stops in the air within its flight is followed from there only."""
+
+
 class AirEffect(Effect):
     """An effect of the air on free bodies, which MuJoCo takes for ellipsoids."""
 
@@ -102,7 +107,7 @@ class AirDrag(AirEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Density times drag factor."""
-        return (Parameter("density", "kg/m^3", float(m.opt.density), 0.0, 500.0, 5.0, scan=(2.0, 10.0)),)
+        return (Parameter("density", "kg/m^3", float(m.opt.density), 0.0, 500.0, 5.0, scan=AIR_DENSITIES),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Density of the medium."""

@@ -298,11 +298,12 @@ def test_the_smallest_detectable_size_is_of_the_most_sensitive_parameter():
 
 
 def test_labels_have_targets_where_names_are_shared():
-    def effect(name: str, *target: str) -> Any:
-        return SimpleNamespace(name=name, target=target, elements=target)
+    def effect(name: str, *target: str, part: str = "") -> Any:
+        return SimpleNamespace(name=name, target=(*target, part) if part else target, elements=target, part=part)
 
-    one, two, three = effect("a", "x"), effect("a", "x", "y"), effect("b", "x")
-    assert [label(e, [one, two, three]) for e in (one, two, three)] == ["a(x)", "a(x, ...)", "b"]
+    one, two, three, four = effect("a", "x"), effect("a", "x", "y"), effect("b", "x"), effect("a", "x", "y", part="kp")
+    among = [one, two, three, four]
+    assert [label(e, among) for e in among] == ["a(x)", "a(x, ...)", "b", "a(x, ..., kp)"]
     model: Any = SimpleNamespace(effects=[SimpleNamespace(effect=one)])
     others = (one, two, three, effect("a", "z"), effect("a"))
     assert [has_effect(model, e) for e in others] == [True, True, False, False, True]

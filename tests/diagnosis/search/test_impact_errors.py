@@ -43,6 +43,23 @@ def test_a_small_effect_of_any_family_but_contacts_must_stand_beside_errors_of_i
 
 
 @pytest.mark.parametrize(
+    ("family", "ratio", "asked"),
+    [("measurement", 1.0, True), ("measurement", 1.2, False), ("contact", 1.0, False)],
+)
+def test_an_effect_of_any_family_but_contacts_must_stand_where_errors_of_impacts_alone_explain_the_data(
+    monkeypatch, family, ratio, asked
+):
+    made, given, after = procedure(), node(1.2, 1000.0), node(1.0, 700.0, effects=1)
+    made.record.findings.append(replace(finding("effect", 0.3), family=family))
+    refitted = []
+    monkeypatch.setattr(
+        made, "_refitted", lambda model, _windows: refitted.append(model) or node(0.98, 990.0, effects=1)
+    )
+    assert made._stand(given, [given, after], node(ratio, 1000.0)) is not asked
+    assert bool(refitted) is asked
+
+
+@pytest.mark.parametrize(
     ("p", "gain", "found", "answer"),
     [
         (0.0025, 0.06, "wind", "rough"),

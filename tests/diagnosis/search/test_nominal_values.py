@@ -246,4 +246,5 @@ def test_nominal_values_stay_as_given_where_that_is_asked_for():
     cfg = cw.DiagnoseCfg(jobs=1, explain=False, effects=("actuator_gain",), nominal=NominalCfg(enabled=False))
     found = cw.diagnose(wrong, pusher(damping=0.05, delay=0.0), cfg)
     assert not found.nominal_values
-    assert found.groups == (("actuator_gain",),)
+    # The velocity gain is right.
+    assert found.groups == (("actuator_gain(shoulder, ..., kp)",),)

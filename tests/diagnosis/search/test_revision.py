@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -345,9 +346,13 @@ def test_an_effect_is_superfluous_where_nominal_values_explain_as_much(monkeypat
         made, last = procedure(), node(1.1, 100.0, 2)
         reduced, instead = node(1.3, errors, 1), None if found is None else node(1.12, found, 1, nominal=2)
         made.record.groups, made.record.hypotheses = [("a",), ("b",)], [{}, {}]
-        monkeypatch.setattr(revision, "refit_without_effect", lambda *_, reduced=reduced: reduced)
+        without = {id(last): reduced}  # the second one is needed
+        refit = partial(lambda known, one, _k: known.get(id(one), node(9.0, 900.0)), without)
+        monkeypatch.setattr(revision, "refit_without_effect", refit)
 
         def nominal(one, *_, reduced=reduced, instead=instead):
+            if one.ratio == 9.0:
+                return None
             assert one is reduced
             return instead if instead is not None else pytest.fail("the effect is superfluous without them")
 
@@ -492,3 +497,14 @@ def test_effects_are_established_by_intervals_that_the_profile_likelihood_does_n
     assert [f.parameters for f in made.record.findings] == wide[1:]
     assert asked == [(last, {k + 1: f"width of {k}" for k in range(4)}, "nominal"), (last, None, "nominal")]
     assert procedure().revision._fitted_together([node(1.0)])[1:] == ([], [])
+
+
+def test_the_last_effect_is_superfluous_too_where_nominal_values_in_place_of_another_explain_as_much(monkeypatch):
+    made, last = procedure(), node(1.0, 100.0, 2)
+    made.record.groups, made.record.hypotheses = [("a",), ("b",)], [{}, {}]
+    made.record.findings += [finding("a", 0.5), finding("b", 0.5, step=1)]
+    instead, alone = node(1.0, 101.0, 1, nominal=2), node(1.0, 102.0, 0, nominal=2)
+    monkeypatch.setattr(revision, "refit_without_effect", lambda one, _k: instead if one is last else alone)
+    assert made.revision.simplified([node(30, 9e4), node(20, 4e4, 1), last]) == [alone]
+    assert made.record.groups == []
+    assert [f.accepted for f in made.record.findings] == [False, False]
