@@ -22,11 +22,15 @@ def covariance_std(channel: Channel) -> float | None:
     return float(np.sqrt(variance.mean())) if variance.size and variance.any() else None
 
 
-def relative_whitening(channel: Channel) -> np.ndarray | None:
+def relative_whitening(channel: Channel, *, own: bool = False) -> np.ndarray | None:
     """Return matrices W that turn residuals r of a channel into W r whose noise is alike in all samples and components.
 
     W is the covariance to the power of -1/2 times the channel's standard deviation (`covariance_std`), so that W r has
     the unit and the size of r; the identity for a sample without covariance.
+
+    Args:
+        channel: The channel.
+        own: Whether the covariances are those of what each sample has for itself, without what samples share.
 
     Returns:
         Shape (T, k, k), symmetric, k as in `Channel.covariance`; None where the channel has no covariance.
@@ -35,6 +39,8 @@ def relative_whitening(channel: Channel) -> np.ndarray | None:
     if std is None:
         return None
     covariance = np.asarray(channel.covariance, float)
+    if own and channel.common is not None:
+        covariance = covariance - channel.common @ np.swapaxes(channel.common, 1, 2)
     known = np.isfinite(covariance).all(axis=(1, 2))
     result = np.repeat(np.eye(covariance.shape[1])[None], len(covariance), axis=0)
     variance, axes = np.linalg.eigh(covariance[known])

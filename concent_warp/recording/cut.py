@@ -36,6 +36,6 @@ def _beginning(d: Demonstration, duration: float, recording: Recording) -> Demon
 def _cut(stream: Any, duration: float) -> Any:
     """Return the samples of a channel, point track or camera up to a time [s]."""
     inside = stream.time <= duration
-    per_sample = ("time", "value", "visible", "covariance", "rgb", "depth")
+    per_sample = ("time", "value", "visible", "covariance", "common", "rgb", "depth")
     arrays = {name: getattr(stream, name, None) for name in per_sample}
     return replace(stream, **{name: array[inside] for name, array in arrays.items() if array is not None})

@@ -115,6 +115,6 @@ def _after(d: Demonstration, start: float) -> Demonstration:
     measured = {}
     for name, one in d.measured.items():
         kept = one.time >= start - 1e-9
-        covariance = None if one.covariance is None else one.covariance[kept]
-        measured[name] = replace(one, time=one.time[kept], value=one.value[kept], covariance=covariance)
+        covariance, common = (None if part is None else part[kept] for part in (one.covariance, one.common))
+        measured[name] = replace(one, time=one.time[kept], value=one.value[kept], covariance=covariance, common=common)
     return earlier(replace(d, measured=measured), start)

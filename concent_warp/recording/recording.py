@@ -38,6 +38,9 @@ class Channel:
     covariance: np.ndarray | None = None
     """Covariance of each sample's error, shape (T, k, k), where known; NaN where the value is missing. k is the
     dimension of the value, and 3 for quaternions, whose error is a rotation vector [rad] in the body's frame."""
+    common: np.ndarray | None = None
+    """What of it the samples share, shape (T, k, m): how each error that all samples of the channel have in common
+    changes a sample, per standard deviation of that error. ``common @ common.T`` is a part of each covariance."""
 
 
 @dataclass(frozen=True)

@@ -88,10 +88,12 @@ def _cleared(d: Demonstration, found: dict[tuple[str, str], np.ndarray]) -> Demo
         if (rows := found.get((d.name, name))) is not None:
             value = np.array(channel.value, dtype=float)
             value[rows] = np.nan
-            covariance = None if channel.covariance is None else np.array(channel.covariance, dtype=float)
-            if covariance is not None:
-                covariance[rows] = np.nan
-            measured[name] = replace(channel, value=value, covariance=covariance)
+            parts = (channel.covariance, channel.common)
+            covariance, common = (None if part is None else np.array(part, dtype=float) for part in parts)
+            for part in (covariance, common):
+                if part is not None:
+                    part[rows] = np.nan
+            measured[name] = replace(channel, value=value, covariance=covariance, common=common)
     return replace(d, measured=measured)
 
 

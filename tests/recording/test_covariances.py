@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
+from concent_warp.recording.cut import beginning
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.validation.validate import validate
@@ -72,3 +73,49 @@ def test_what_is_no_covariance_is_refused(edit, message):
     with pytest.raises(RecordingError, match=message) as caught:
         validate(with_covariance(edit))
     assert "block_position" in str(caught.value)
+
+
+def with_common(edit=None) -> Recording:
+    """Return the recording whose position has errors in common, after a change of these."""
+    recording = with_covariance()
+    first = recording[0]
+    channel = first.measured[NAMES[0]]
+    common = np.tile(np.array([[1e-3, 0.0], [0.0, 1e-3], [0.0, 1e-4]]), (len(channel.time), 1, 1))
+    common[np.isnan(channel.value).any(axis=1)] = np.nan
+    measured = {**first.measured, NAMES[0]: replace(channel, common=common if edit is None else edit(common))}
+    return replace(recording, demonstrations=(replace(first, measured=measured), *recording.demonstrations[1:]))
+
+
+def test_errors_in_common_are_read_as_they_were_written_and_cut_with_the_samples(tmp_path):
+    recording = with_common()
+    write_hdf5(recording, tmp_path / "a.h5")
+    read = read_hdf5(tmp_path / "a.h5")
+    np.testing.assert_array_equal(read[0].measured[NAMES[0]].common, recording[0].measured[NAMES[0]].common)
+    assert read[0].measured[NAMES[1]].common is None
+    validate(read)
+    half = beginning(read, read[0].measured[NAMES[0]].time[2])[0].measured[NAMES[0]]
+    assert half.common is not None
+    assert len(half.common) == len(half.time) == 3
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda c: c[:-1], "wrong shape of common"),
+        (lambda c: c[:, :2], "wrong shape of common"),
+        (set_at(3, np.nan), "an error in common is missing"),
+        (lambda c: 1.1 * c, "errors in common exceed the covariance"),
+    ],
+)
+def test_errors_in_common_that_are_no_part_of_the_covariance_are_refused(edit, message):
+    with pytest.raises(RecordingError, match=message) as caught:
+        validate(with_common(edit))
+    assert "block_position" in str(caught.value)
+
+
+def test_errors_in_common_without_a_covariance_are_refused():
+    recording = with_common()
+    first = recording[0]
+    measured = {**first.measured, NAMES[0]: replace(first.measured[NAMES[0]], covariance=None)}
+    with pytest.raises(RecordingError, match="errors in common without a covariance"):
+        validate(replace(recording, demonstrations=(replace(first, measured=measured), *recording.demonstrations[1:])))

@@ -143,6 +143,13 @@ class Reading:
         """Return measured less predicted, shape (T, dim), in units of noise, for the components that were measured."""
         return self.residuals(whitened(value, self.whitening) / self.std)
 
+    def common_in_noise(self, common: np.ndarray) -> np.ndarray:
+        """Return what errors in common, shape (T, dim, m), change in units of noise, one row for each residual."""
+        changes = np.moveaxis(np.nan_to_num(common), 2, 0)
+        if self.known is not None and not self.orientation:
+            changes = np.where(self.known, changes, np.nan)
+        return np.stack([np.nan_to_num(self.in_noise(change)) for change in changes], axis=1)
+
     def residuals(self, value: np.ndarray) -> np.ndarray:
         """Return what (T, dim) is for the components that were measured, one after the other."""
         return value.ravel() if self.known is None else value[self.known]
@@ -235,7 +242,10 @@ class Window:
     defect: TimeStepDefect | None = None
     """Correction of the predictions for a time step that is too long; None for none."""
     scatter: NumericalScatter | None = None
-    """Numerical scatter of the predictions; None for none."""
+    """Numerical scatter of the predictions, with what readings have in common; None for none."""
+    common: np.ndarray | None = field(default=None, repr=False)
+    """Changes of the residuals per standard deviation of errors that all samples of a channel share (`Channel.common`),
+    shape (count, m); None for none."""
 
 
 def first_part(w: Window, length: float) -> Window:
@@ -265,6 +275,7 @@ def first_part(w: Window, length: float) -> Window:
     chosen = np.concatenate(rows)
     defect = None if w.defect is None else replace(w.defect, residual=w.defect.residual[chosen])
     scatter = None if w.scatter is None else w.scatter.rows(chosen)
+    common = None if w.common is None else w.common[chosen]
     return replace(
         w,
         end=w.start + length,
@@ -273,6 +284,7 @@ def first_part(w: Window, length: float) -> Window:
         clock=w.clock[chosen],
         defect=defect,
         scatter=scatter,
+        common=common,
     )
 
 
@@ -407,7 +419,7 @@ class ObservedRecording:
         """Return a window; None where nothing was measured in it."""
         m = self.model.scene.model
         d = self.recording.demonstrations[number]
-        readings, clock, count = [], [], 0
+        readings, clock, shared, count = [], [], [], 0
         for name, std in self.noise.items():
             if name not in d.measured:
                 continue
@@ -425,12 +437,15 @@ class ObservedRecording:
             known = None if finite.all() else finite
             size = dim * len(value) if known is None else int(known.sum())
             time = channel.time[inside]
-            whitening = relative_whitening(channel)
+            whitening, stated = relative_whitening(channel, own=True), self._stated(name)
             if whitening is not None:
                 own = channel.noise_std or covariance_std(channel) or std
-                whitening = whitening[inside] * (std / own)
+                whitening = whitening[inside] * (stated / own)
             rows = slice(count, count + size)
             readings.append(Reading(name, rows, time - start, value, std, orientation, known, whitening))
+            if whitening is not None and channel.common is not None:
+                # Noise that is raised raises errors in common, too.
+                shared.append((rows, readings[-1].common_in_noise(channel.common[inside] * (std / stated))))
             clock.append(np.repeat(time, dim if known is None else known.sum(axis=1)))
             count += size
         if not count:
@@ -438,7 +453,20 @@ class ObservedRecording:
         state, noise = self.state(d, start), {r.channel: r.std for r in readings}
         spread = start_spread(m, noise, self.cfg, measured=None if state.measured.all() else state.measured)
         clocks = np.concatenate(clock)
-        return Window(d, number, start, end, state.qpos, state.qvel, spread, tuple(readings), count, clocks)
+        found = Window(d, number, start, end, state.qpos, state.qvel, spread, tuple(readings), count, clocks)
+        if not shared:
+            return found
+        common, column = np.zeros((count, sum(part.shape[1] for _, part in shared))), 0
+        for rows, part in shared:
+            common[rows, column : column + part.shape[1]] = part
+            column += part.shape[1]
+        return replace(found, common=common, scatter=NumericalScatter(common))
+
+    def _stated(self, name: str) -> float:
+        """Return the noise of a channel with covariances as the recording states it, that of all demonstrations."""
+        channels = [d.measured[name] for d in self.recording.demonstrations if name in d.measured]
+        stated = [std for c in channels if (std := c.noise_std or covariance_std(c))]
+        return float(np.sqrt(np.mean(np.square(stated)))) if stated else self.noise[name]
 
 
 def first_time(d: Demonstration, channels: Sequence[str]) -> float:

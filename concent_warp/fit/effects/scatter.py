@@ -61,7 +61,7 @@ def with_scatter(
     starts = [None] * len(windows) if offsets is None else list(offsets)
     trials = {k: _shifted(prediction, k, cfg, starts[k]) for k in rough}
     courses = iter(prediction.courses([trial for k in rough for trial in trials[k]]))
-    found = list(windows)
+    found = [w if w.common is None else replace(w, scatter=NumericalScatter(w.common)) for w in windows]
     for k in rough:
         seen = np.array([prediction.observed(k, next(courses).reader, trial.values) for trial in trials[k]])
         by_impacts = impact_deviations(prediction, k, cfg, starts[k])
@@ -137,7 +137,9 @@ def _scatter(
         own = own if own.max(initial=0.0) > cfg.min_scatter else None
     directions, size, _ = np.linalg.svd(deviations, full_matrices=False)
     kept = size > cfg.min_scatter
-    return NumericalScatter(directions[:, kept] * size[kept], own) if kept.any() else None
+    if w.common is None:
+        return NumericalScatter(directions[:, kept] * size[kept], own) if kept.any() else None
+    return NumericalScatter(np.hstack([directions[:, kept] * size[kept], w.common]), own)
 
 
 def _of_single_bodies(m: mujoco.MjModel, w: Window, count: int) -> np.ndarray:

@@ -29,7 +29,7 @@ class Bundle:
     measurements: list[PoseMeasurement | None]
     """One for each moment."""
     common: np.ndarray
-    """Covariance of the errors that do not change from frame to frame, shape (T, 6, 6)."""
+    """Change of each pose per standard deviation of errors that do not change from frame to frame, shape (T, 6, E)."""
 
 
 def bundled(fits: list[Fit | None], keyframes: int, cfg: AlignCfg, turns: Sequence[np.ndarray] = ()) -> Bundle:
@@ -60,7 +60,8 @@ def bundled(fits: list[Fit | None], keyframes: int, cfg: AlignCfg, turns: Sequen
     covariance = np.linalg.inv(matrix) if size else np.zeros((0, 0))
     error, sensitivity = covariance @ right, covariance @ sensitivity
     std = bias_stds(cfg)
-    measurements, common = [], np.zeros((len(fits), 6, 6))
+    measurements, common = [], np.zeros((len(fits), 6, BIASES + size))
+    root = np.linalg.cholesky((covariance + covariance.T) / 2) if size else covariance
     for t, fit in enumerate(fits):
         if fit is None:
             measurements.append(None)
@@ -76,8 +77,7 @@ def bundled(fits: list[Fit | None], keyframes: int, cfg: AlignCfg, turns: Sequen
             bias += across @ sensitivity[rows]
             unknown[:, rows] += across
         inverse = np.linalg.inv(information + 1e-3 * LOOSE)
-        bias = inverse @ bias * std
-        common[t] = bias @ bias.T + inverse @ (unknown @ covariance @ unknown.T) @ inverse
+        common[t] = np.hstack([inverse @ bias * std, inverse @ unknown @ root])
         measurements.append(PoseMeasurement(fit.pose, information, gradient))
     return Bundle(measurements, common)
 

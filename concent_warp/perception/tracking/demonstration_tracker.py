@@ -170,22 +170,25 @@ def _smoothed(tracker: BodyTracker, video: Video, cfg: TrackCfg, name: str) -> B
     covariance = np.full((len(time), 6, 6), np.nan)
     seen = np.array([fit is not None for fit in tracker.fits])
     bundle = bundled(*tracker.numbered_fits(), cfg.align, tracker.keyframe_turns())
+    common = np.full(bundle.common.shape, np.nan)
+    centre = tracker.symmetry.centre if tracker.symmetry.chosen_turns().any() else None
     # Stretches between long gaps are independent: nothing is known of the motion in between.
     rows = np.flatnonzero(seen)
     for part in np.split(rows, np.flatnonzero(np.diff(time[rows]) > cfg.smooth.max_gap) + 1) if len(rows) else []:
         span = slice(part[0], part[-1] + 1)
-        poses, covariances = smooth(time[span], bundle.measurements[span], tracker.shape.radius, cfg.smooth)
+        poses, covariances = smooth(time[span], bundle.measurements[span], tracker.shape.radius, cfg.smooth, centre)
         shared = np.array([bundle.common[part[np.abs(part - t).argmin()]] for t in range(part[0], part[-1] + 1)])
-        pose[span], covariance[span] = poses, covariances + shared
+        pose[span], covariance[span] = poses, covariances + shared @ np.swapaxes(shared, 1, 2)
+        common[span] = shared
     # A gap in which the velocity has jumped cannot be bridged.
     worst = np.sqrt(np.linalg.eigvalsh(np.where(np.isfinite(covariance), covariance, 0.0)[:, :3, :3])[:, -1])
     unknown = ~seen & (worst > cfg.accept.max_translation_std)
-    pose[unknown], covariance[unknown] = np.nan, np.nan
+    pose[unknown], covariance[unknown], common[unknown] = np.nan, np.nan, np.nan
     textured = any(fit is not None and fit.texture for fit in tracker.fits)
     quality = _quality(tracker, np.isfinite(pose[:, 0, 0]))
     return BodyTrack(
         name, tracker.shape.name, time, pose, covariance, tracker.symmetry.name, textured, tracker.reason, quality,
-        tuple(video.cameras),
+        tuple(video.cameras), common,
     )  # fmt: skip
 
 

@@ -24,6 +24,8 @@ NAMES = {"framepos": "{}_position", "framequat": "{}_orientation"}
 """Their names where the scene has none to follow."""
 MAX_BALL_ORIENTATION_STD = 0.15
 """Usual standard deviation of a ball's rotation from which on its orientation counts as unknown [rad]."""
+MIN_COMMON_SHARE = 1e-3
+"""Variance of an error that samples have in common, over that of the samples, from which on it is written [-]."""
 POINT_SLACK = 0.04
 """Distance of a surface in front of a point, over the body's reach, below which the point is seen [-]."""
 
@@ -79,10 +81,12 @@ def pose_channels(track: BodyTrack) -> dict[str, Channel]:
     quaternion[~oriented] = np.nan
     turn = track.pose[:, :3, :3]
     in_body = np.swapaxes(turn, 1, 2) @ track.covariance[:, 3:, 3:] @ turn
-    channels = {"framepos": _channel(track.time, position, track.covariance[:, :3, :3])}
+    shift, rotation = (None, None) if track.common is None else np.split(track.common, 2, axis=1)
+    channels = {"framepos": _channel(track.time, position, track.covariance[:, :3, :3], shift)}
     if oriented.any():
         in_body = np.where(oriented[:, None, None], in_body, np.nan)
-        channels["framequat"] = _channel(track.time, signs[:, None] * quaternion, in_body)
+        rotation = None if rotation is None else np.swapaxes(turn, 1, 2) @ rotation
+        channels["framequat"] = _channel(track.time, signs[:, None] * quaternion, in_body, rotation)
     return channels
 
 
@@ -95,11 +99,38 @@ def has_orientation(track: BodyTrack) -> np.ndarray:
     return known
 
 
-def _channel(time: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> Channel:
-    """Return a channel whose noise is the root mean square of its covariances' standard deviations."""
+def _channel(time: np.ndarray, value: np.ndarray, covariance: np.ndarray, common: np.ndarray | None) -> Channel:
+    """Return a channel whose noise is the root mean square of its covariances' standard deviations.
+
+    Args:
+        time: Times [s], shape (T,).
+        value: Values, shape (T, dim).
+        covariance: Shape (T, 3, 3).
+        common: What of it the samples share, shape (T, 3, E); None where that is not known.
+    """
     covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
     std = float(np.sqrt(np.nanmean(np.einsum("tii->ti", covariance))))
-    return Channel(time, value, std, None, covariance)
+    return Channel(time, value, std, None, covariance, None if common is None else main_errors(common, covariance))
+
+
+def main_errors(common: np.ndarray, covariance: np.ndarray) -> np.ndarray | None:
+    """Return few errors in common that stand for many, shape (T, k, m); None where they are small.
+
+    The principal directions over all samples are kept in which they amount to `MIN_COMMON_SHARE` of the variance.
+
+    Args:
+        common: Errors in common, shape (T, k, E); NaN where a sample is missing.
+        covariance: Of the samples, shape (T, k, k).
+    """
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    count, k, _ = common.shape
+    directions, size, _ = np.linalg.svd(common[known].reshape(int(known.sum()) * k, -1), full_matrices=False)
+    kept = size**2 > MIN_COMMON_SHARE * float(np.einsum("tii->", covariance[known]))
+    if not kept.any():
+        return None
+    found = np.full((count, k, int(kept.sum())), np.nan)
+    found[known] = (directions[:, kept] * size[kept]).reshape(-1, k, int(kept.sum()))
+    return found
 
 
 def point_track(

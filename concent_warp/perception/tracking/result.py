@@ -80,6 +80,10 @@ class BodyTrack:
     """What the frames of each moment say about the pose; `track` gives it."""
     cameras: tuple[str, ...] = ()
     """Cameras that the body was tracked with; empty where that is not known."""
+    common: np.ndarray | None = None
+    """What of the covariances all moments share: change of position [m] and rotation vector [rad], per standard
+    deviation of errors that do not change from frame to frame, as of the camera's depth, shape (T, 6, E); None where
+    unknown."""
 
     @property
     def lost(self) -> np.ndarray:

@@ -20,6 +20,8 @@ from concent_warp.perception.tracking.geometry.pose import moved, twist_between
 
 MAX_IMPACTS = 20
 """Most impacts looked for in one stretch of a track."""
+ANY_TURN = np.pi / np.sqrt(3)
+"""Standard deviation of a turn of which nothing is known [rad]: all up to half a turn either way are equally likely."""
 START_SPEED = 0.5
 """Standard deviation of the speed before the first measurement [m/s], of rotations over the radius."""
 
@@ -37,7 +39,11 @@ class PoseMeasurement:
 
 
 def smooth(
-    time: np.ndarray, measurements: Sequence[PoseMeasurement | None], radius: float, cfg: SmoothCfg
+    time: np.ndarray,
+    measurements: Sequence[PoseMeasurement | None],
+    radius: float,
+    cfg: SmoothCfg,
+    centre: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return poses, shape (T, 4, 4), and covariances of their twists, shape (T, 6, 6).
 
@@ -46,7 +52,13 @@ def smooth(
         measurements: What each says, the first and at least one; None where the object was not seen.
         radius: Radius of the object [m].
         cfg: Settings.
+        centre: Middle of a round object [m], body frame, shape (3,). Its motion is smoothed: that of the body's origin
+            beside it would be as little known as turns that nothing shows, whose errors grow without limit.
     """
+    if centre is not None:
+        poses, covariances = smooth(time, [m and _about(m, centre) for m in measurements], radius, cfg)
+        found = [_from(pose, covariance, centre) for pose, covariance in zip(poses, covariances, strict=True)]
+        return np.array([pose for pose, _ in found]), np.array([covariance for _, covariance in found])
     runs = [_filtered(time, measurements, radius, np.full(len(time), a)) for a in cfg.acceleration]
     likelihood = np.array([run.likelihood for run in runs])
     window = np.abs(time[:, None] - time[None]) <= cfg.window / 2
@@ -67,6 +79,36 @@ def smooth(
         acceleration[first : worst + 2] = cfg.impact
         run = _filtered(time, measurements, radius, acceleration)
     return _backward(run)
+
+
+def _about(measurement: PoseMeasurement, centre: np.ndarray) -> PoseMeasurement:
+    """Return a measurement of a body's pose as that of a frame in another point of it [m], shape (3,)."""
+    pose = measurement.pose.copy()
+    arm = pose[:3, :3] @ centre
+    pose[:3, 3] += arm
+    back = _shift(arm)
+    return PoseMeasurement(pose, back.T @ measurement.information @ back, back.T @ measurement.gradient)
+
+
+def _from(pose: np.ndarray, covariance: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pose and covariance of a body from those of a frame in a point of it [m], shape (3,).
+
+    No turn is less known than one of which nothing is known.
+    """
+    pose, arm = pose.copy(), pose[:3, :3] @ centre
+    pose[:3, 3] -= arm
+    variance, axes = np.linalg.eigh(covariance[3:, 3:])
+    within = np.eye(6)
+    within[3:, 3:] = (axes * (ANY_TURN / np.sqrt(np.maximum(variance, ANY_TURN**2)))) @ axes.T
+    back = _shift(arm) @ within
+    return pose, back @ covariance @ back.T
+
+
+def _shift(arm: np.ndarray) -> np.ndarray:
+    """Return the matrix, shape (6, 6), from the twist of a frame that is `arm` [m] away to that of the body."""
+    matrix = np.eye(6)
+    matrix[:3, 3:] = [[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]
+    return matrix
 
 
 @dataclass(frozen=True)

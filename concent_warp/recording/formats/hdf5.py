@@ -127,6 +127,8 @@ def _write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream)
             group.attrs["frame"] = _text(stream.frame)
         if stream.covariance is not None:
             _store(group, "covariance", np.asarray(stream.covariance, dtype=float))
+        if stream.common is not None:
+            _store(group, "common", np.asarray(stream.common, dtype=float))
 
 
 def _text(value: str) -> np.ndarray:
@@ -244,7 +246,7 @@ class Reader(SafeFile):
 
     def channel(self, group: h5py.Group) -> Channel:
         """Read a commanded or measured channel."""
-        self.refuse_unknown(group, {"time", "value", "covariance"}, {"noise_std", "frame"})
+        self.refuse_unknown(group, {"time", "value", "covariance", "common"}, {"noise_std", "frame"})
         noise = self.attribute(group, "noise_std")
         if noise is not None and (np.shape(noise) != () or np.asarray(noise).dtype.kind not in "fiu"):
             raise self.error("noise_std is not a number", group.name, expected="one number", found=noise)
@@ -254,6 +256,7 @@ class Reader(SafeFile):
             None if noise is None else float(noise),
             self.text_attribute(group, "frame"),
             self.array(group, "covariance") if "covariance" in group else None,
+            self.array(group, "common") if "common" in group else None,
         )
 
     def policy(self, group: h5py.Group) -> PolicyLog:

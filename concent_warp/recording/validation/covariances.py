@@ -44,6 +44,39 @@ def check_covariance(covariance: np.ndarray, value: np.ndarray, dimension: int, 
     )
 
 
+def check_common(common: np.ndarray, covariance: np.ndarray | None, value: np.ndarray, place: ErrorLocation) -> None:
+    """Check that what samples have in common is a part of their covariances.
+
+    Args:
+        common: Shape (T, k, m).
+        covariance: Shape (T, k, k), checked; None where there is none.
+        value: Values, shape (T, dim).
+        place: For messages.
+
+    Raises:
+        RecordingError: With the first thing that is wrong.
+    """
+    matrix = np.asarray(common)
+    if covariance is None:
+        raise place.error("errors in common without a covariance", fix="write the covariances that they are a part of")
+    size = np.asarray(covariance).shape[:2]
+    if matrix.ndim != 3 or matrix.shape[:2] != size or matrix.dtype.kind not in "fiu":
+        expected = f"({size[0]}, {size[1]}, number of errors)"
+        raise place.error("wrong shape of common", expected=expected, found=f"{matrix.shape} {matrix.dtype}")
+    given = np.asarray(np.isfinite(np.asarray(value, float)).all(axis=1))
+    known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
+    what = "an error in common is missing"
+    _refuse(np.asarray(given & ~known), place, what, "finite numbers where there is a value", matrix)
+    rows = np.flatnonzero(given)
+    own, alone = np.asarray(covariance, float)[rows], np.asarray(matrix, float)[rows]
+    bad = np.zeros(len(value), dtype=bool)
+    if len(rows):
+        least = np.linalg.eigvalsh(own - alone @ np.swapaxes(alone, 1, 2))[:, 0]
+        bad[rows] = least < -ROUNDING * np.abs(own).max(axis=(1, 2))
+    what = "errors in common exceed the covariance"
+    _refuse(bad, place, what, "common times its transpose is a part of the covariance", matrix)
+
+
 def _refuse(bad: np.ndarray, place: ErrorLocation, what: str, expected: str, matrix: np.ndarray) -> None:
     """Raise an error for the first sample, if any, that is bad, shape (T,) bool."""
     if bad.any():

@@ -23,7 +23,7 @@ from concent_warp.recording.recording import Channel, Demonstration, PointTrack,
 from concent_warp.recording.unwind import commanded_hinge, measured_hinge, wraps
 from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.clocks import check_clocks
-from concent_warp.recording.validation.covariances import check_covariance
+from concent_warp.recording.validation.covariances import check_common, check_covariance
 from concent_warp.recording.validation.falls import units_of_falls
 from concent_warp.recording.validation.images import check_image
 from concent_warp.recording.validation.location import ErrorLocation
@@ -155,7 +155,7 @@ def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Err
     _check_time(channel.time, place)
     _check_shape(channel.value, (len(channel.time),), place, fix="write one command per time")
     _check_finite(channel.value, place, missing_allowed=False)
-    if channel.covariance is not None:
+    if channel.covariance is not None or channel.common is not None:
         raise place.error("a command has no covariance", fix="leave it out")
     check_command(np.asarray(channel.value), model, row, place, cfg.units)
     if commanded_hinge(model, name) is not None:
@@ -182,6 +182,8 @@ def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: E
     quaternion = model.sensor_type[row] in QUATERNION_SENSORS
     if channel.covariance is not None:
         check_covariance(channel.covariance, value, 3 if quaternion else value.shape[1], place)
+    if channel.common is not None:
+        check_common(channel.common, channel.covariance, value, place)
     if quaternion:
         _check_quaternions(value, place, cfg)
     check_measurement(value, model, row, place, cfg.units)
