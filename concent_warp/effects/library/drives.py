@@ -125,7 +125,9 @@ class ActuatorGain(DriveEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor for each actuator."""
-        return self.parameter_per_target(self.part or "gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
+        # More velocity feedback is damping of the joint, and common.
+        high = 1.0 if self.part == KV else 5.0
+        return self.parameter_per_target(self.part or "gain", "-", 1.0, low=0.05, high=high, scale=0.2)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Gain and bias."""
