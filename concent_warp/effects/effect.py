@@ -237,6 +237,11 @@ class Effect:
         return bool(self.part)
 
     @property
+    def is_alone(self) -> bool:
+        """Whether it is named only where it explains the data without others: else it may imitate several of them."""
+        return False
+
+    @property
     def edits(self) -> bool:
         """Whether the values enter the MJCF, so that each set of values is compiled by itself."""
         return type(self).edit is not Effect.edit

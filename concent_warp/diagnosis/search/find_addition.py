@@ -21,6 +21,7 @@ from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
 from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.candidates.screening import linear_at_measured_states, ranking, screen
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
@@ -109,6 +110,7 @@ class AdditionFinder:
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
             fitted = fits.fit(more, max(critical, cfg.min_gain), short_windows, least)
+            fitted = without_imitations(fitted, cfg)
         for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
             context.budget.note(sentence, step if decides else None)
         if not fitted and fits.left:
@@ -268,3 +270,8 @@ class AdditionFinder:
         names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
         context.progress(ranking(base, screened, names, cfg.seed))
         return self.gradient.apply(base, screened, context.runner) if self.gradient else screened
+
+
+def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:
+    """Return candidates less those that count only where they explain the data alone, and leave more than they may."""
+    return [c for c in fitted if not c.effect.is_alone or c.ratio <= cfg.form_error_ratio]

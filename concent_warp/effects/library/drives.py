@@ -109,6 +109,11 @@ class ActuatorGain(DriveEffect):
         if self.part:
             self.rarity = PART_RARITY  # pyright: ignore[reportAttributeAccessIssue]
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether one gain alone is off, which resembles a gain and damping, or a mass and damping, together."""
+        return self.is_part
+
     def has_as_special_case(self, other: Effect) -> bool:
         """Return whether a damping of joints is what more velocity feedback is."""
         return super().has_as_special_case(other) or (self.part == KV and other.name == JointDamping.name)

@@ -11,6 +11,7 @@ import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search import find_addition
+from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.made_up import CLEAR, OPEN, finding, node, procedure
 
@@ -297,7 +298,10 @@ class Parts:
         self.time = True
         notes, found = self, {}
         for name, (gain, ratio) in fits.items():
-            found[name] = MadeUp(name=name, gain=gain, ratio=ratio, model=SimpleNamespace(effects=[name]))
+            effect = SimpleNamespace(name=name, is_alone=False)
+            found[name] = MadeUp(
+                name=name, gain=gain, ratio=ratio, effect=effect, model=SimpleNamespace(effects=[name])
+            )
         effects = [candidate("whole"), candidate("part", is_part=True), candidate("other")]
 
         class Fits:
@@ -397,3 +401,10 @@ def test_without_time_for_parts_the_other_candidates_stay(monkeypatch):
     assert parts.find(made)[0] == "whole"
     assert made.context.budget.unsettled == ["Not screened: part."]
     assert made.context.budget.cut == {0}
+
+
+@pytest.mark.parametrize(("ratio", "kept"), [(1.9, True), (2.1, False)])
+def test_a_single_gain_that_leaves_much_is_no_candidate(ratio, kept):
+    part, whole = ActuatorGain("servo", "kp"), ActuatorGain("servo")
+    fitted: list[Any] = [SimpleNamespace(effect=e, ratio=ratio) for e in (part, whole)]
+    assert find_addition.without_imitations(fitted, DiagnoseCfg()) == fitted[0 if kept else 1 :]
