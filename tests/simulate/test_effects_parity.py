@@ -64,7 +64,7 @@ def typical(effect: Effect, m) -> list[float]:
     # A limit must be low to act.
     parts = [4 if np.isinf(p.null) else 2 for p in rows]
     return [
-        p.scan[len(p.scan) // part] if p.scan else min(p.null + p.scale, p.high)
+        p.scan[len(p.scan) // part] if p.scan else p.null + (p.scale if p.null < p.high else -p.scale)
         for p, part in zip(rows, parts, strict=True)
     ]
 
