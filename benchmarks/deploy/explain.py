@@ -7,6 +7,8 @@ python -m benchmarks.deploy.explain --table                    # the page from t
 
 from __future__ import annotations
 
+import json
+import textwrap
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -30,19 +32,49 @@ from concent_warp.simulate.parallel import limit_simulations
 from concent_warp.train.trials.evaluate import wilson
 
 NAME = "explain"
-SEED = 700
-"""First seed of the trials; other ones, and other magnitudes, were used for development."""
+METHOD = "windows, small errors preferred"
+"""How an error of tracked poses is searched for. Rows of another method are measured again; the first ones had none."""
+METHODS = ("windows", METHOD)
+"""Methods that differ little from it."""
+EFFECTS = FOLDER / "data" / f"{NAME}_effects.jsonl"
+"""Rows of changed physics alone, measured with `--seconds 1000` to see whether the missing effect is named."""
+SEED = 400
+"""First seed of the trials; other ones were used for development."""
 INTRODUCTION = """\
 `python -m benchmarks.deploy.explain`: the insertion policy of the package in Reality, which neither the model nor the
 policy knows, with one thing wrong on purpose; `concent explain` gets the recording of the trials and names the cause.
 20 cases of each cause: poses of the block, or of all objects, with a constant error (`--sensors.position-bias`,
 `--sensors.orientation-bias`); ten hidden effects (`--hide`) of two magnitudes; and policies that are too weak: smaller
 steps or leads of the commands, noise on the weights, trainings that were stopped early. A case has one seed, and as
-many episodes as it takes to have six failed trials, at most 96. Where no trial failed, the case says nothing. *All
-together* is the verdict from six failed trials and four successful ones, *one by one* that of single trials, given the
-others. Settings are the defaults, one process a case.
-"""
-NOTES = """\
+many episodes as it takes to have six failed trials, at most 96; the effect is searched for in two of them. Where no
+trial failed, the case says nothing. *All together* is the verdict from six failed trials and four successful ones,
+*one by one* that of single trials, given the others.
+
+47 of 60 cases were begun and ended on a machine with 16 cores that was held for half an hour. Of the other 13, seven
+were measured later with the present search; the five short trainings and `joint_compliance=0.015` have none below.
+Policies with noise on their weights fail in 2 to 15 % of their trials alone; their five cases stay unexplained. A
+diagnosis had 600 s of one slow processor. Those of these cases searched in two whole trials, contacts included, and
+named one effect of 18. The present version searches in the robot's free motion where this differs. All 20 cases of
+changed physics were measured again with that, on 16 slow cores, 12 cases at a time with `--seconds 1000`, before
+errors of poses were searched for in short windows: the table of missing effects is theirs. The hidden damping is
+above what the library tries (37 to 44 times the nominal one).
+
+Errors of poses were searched for by replays of whole trials then. Some of the cases were measured again with the
+search that is there now, on less than half a core beside other work: all of perception that had been named wrongly,
+and a few that had been named rightly, of each cause, as long as there was time; every case that was begun counts.
+What had been right and was not measured again could be wrong now; two cases, `stribeck_friction=4` and
+`load_friction=0.3`, were begun again and cut off, and stand as they were. Seeds and magnitudes are those of the first
+measurement; others were used for development. A diagnosis had 60 s then (`--seconds 60`): it names no effect in so
+short a time, and is not needed to say that the physics differ.
+
+In one of them, shift 9, nothing was touched, so that all errors above some size explained as much; a far too large
+one was taken, and the verdict was policy. The search has preferred small errors since. This case was measured again
+with that, and so were all but those that are listed below the first table.
+
+Tried in development, with other seeds: of two turns about the axis of the fingers (0.135 and 0.16 rad) neither was
+found, since the object pivots in the grasp; a block that is 4 % larger (`--hide size=1.04`) and pads that slip
+(`--hide pad_friction=0.1`), both contact physics, were not taken for errors of poses.
+
 What the figures do not show: other tasks and robots; two causes at once; errors of poses that differ from trial to
 trial; trials without tracked poses; scenes whose shapes are wrong, since Reality's are those of the scene with
 chamfered edges.
@@ -77,6 +109,8 @@ def main(args: Args) -> None:
     """Explain what is not done yet, and write the page."""
     kept, known = Measurements(args.data), cases()
     wanted = [] if args.table else [k for k, c in enumerate(known) if not args.names or c.name in args.names]
+    earlier = dict(kept.rows)
+    kept.rows = {name: row for name, row in earlier.items() if row.get("method") == METHOD}
     left = [k for k in wanted if kept.wanted(known[k].name)]
     if args.names:
         left.sort(key=lambda k: args.names.index(known[k].name))
@@ -89,10 +123,16 @@ def main(args: Args) -> None:
                 row = task.result()
             except Exception as error:  # a case that fails must not end the others
                 row = {"error": f"{type(error).__name__}: {error}"}
-            kept.add(tasks[task], {"machine": machine(), **row})
-    rows = {name: row for name, row in kept.rows.items() if "error" not in row}
+            kept.add(tasks[task], {"machine": machine(), "method": METHOD, **row})
+    rows = {name: row for name, row in {**earlier, **kept.rows}.items() if "error" not in row}
     if args.seed == SEED and rows:
-        write_page(NAME, page(rows))
+        write_page(NAME, page(rows, first_rows(args.data), Measurements(EFFECTS).rows))
+
+
+def first_rows(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the rows of cases that were measured before by another method."""
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    return {row["key"]: row for row in reversed(rows) if row.get("method") not in METHODS and "error" not in row}
 
 
 def study(case: Case, seed: int, args: Args) -> dict[str, Any]:
@@ -139,37 +179,70 @@ def study(case: Case, seed: int, args: Args) -> dict[str, Any]:
     }
 
 
-def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the page of all cases."""
+def page(
+    rows: Mapping[str, Mapping[str, Any]],
+    earlier: Mapping[str, Mapping[str, Any]] | None = None,
+    searched: Mapping[str, Mapping[str, Any]] | None = None,
+) -> str:
+    """Return the page.
+
+    Args:
+        rows: The latest row of each case.
+        earlier: Rows of the same cases by another method, for comparison.
+        searched: Rows that had time to find the missing effect; the latest ones by default.
+    """
+    earlier = earlier or {}
     judged = {name: row for name, row in rows.items() if row["found"] is not None}
-    summary, detail = [], []
+    now = [row for row in judged.values() if row.get("method") in METHODS]
+    summary, compared, detail = [], [], []
     for cause in ("perception", "physics", "policy", "all"):
         mine = [row for row in judged.values() if cause in (row["cause"], "all")]
         summary.append([cause, *_shares(_named(mine)), *_shares(_one_by_one(mine))])
-    physics = {name: row for name, row in judged.items() if row["cause"] == "physics"}
-    named = [_kinds(row.get("effects", [])[:1]) == [row["effect"]] for row in physics.values()]
-    grouped = [any(row["effect"] in _kinds(group) for group in row.get("groups", [])[:1]) for row in physics.values()]
+        mine = [row for row in now if cause in (row["cause"], "all")]
+        before = [earlier[row["key"]] for row in mine if row.get("key") in earlier]
+        compared.append([cause, *_shares(_named(mine)), *_shares(_one_by_one(mine)), _shares(_named(before))[0]])
+    physics = [row for row in (searched or judged).values() if row["cause"] == "physics"]
+    named = [_kinds(row.get("effects", [])[:1]) == [row["effect"]] for row in physics]
+    grouped = [any(row["effect"] in _kinds(group) for group in row.get("groups", [])[:1]) for row in physics]
     answers = [
-        [name, ", ".join(row.get("effects", [])), row.get("verdict") or "-", f"{row.get('seconds', 0):.0f}"]
-        for name, row in sorted(physics.items())
+        [name, ", ".join(row.get("effects", [])), row.get("verdict"), f"{row.get('seconds', 0):.0f}"]
+        for name, row in sorted((searched or {}).items())
     ]
     for name, row in rows.items():
         found = ", ".join(row.get("effects", []))
         bias = row.get("bias")
         shift = "" if bias is None else " ".join(f"{1e3 * v:+.1f}" for v in bias[:3])
         counts = f"{sum(one == row['cause'] for one in row.get('one by one', []))} of {len(row.get('one by one', []))}"
+        before = "" if row.get("method") not in METHODS else earlier.get(name, {}).get("found", "")
         detail.append(
-            [name, row["cause"], row["found"] or "no trial failed", counts, found, shift,
+            [name, row["cause"], row["found"] or "no trial failed", before, counts, found, shift,
              f"{row['failed']} of {row['episodes']}", f"{row.get('seconds', 0):.0f}"]
         )  # fmt: skip
+    older = ", ".join(name for name, row in judged.items() if row.get("method") in METHODS[:-1]) or "none"
     head = ["cause", "all together", "95 %", "one by one", "95 %"]
-    columns = ["case", "cause", "found", "one by one", "effect named", "error of poses found [mm]", "failed", "seconds"]
+    columns = [
+        "case",
+        "cause",
+        "found",
+        "before",
+        "one by one",
+        "effect named",
+        "error of poses found [mm]",
+        "failed",
+        "seconds",
+    ]
     effects = f"Of {len(named)} cases of changed physics the missing effect is named first in {sum(named)} "
     effects += f"({_shares(named)[1]}), and is among those that the data cannot distinguish in {sum(grouped)}."
+    without = textwrap.fill(f"Those without the preference for small errors: {older}.", 118)
+    measured = {**rows, **{f"{name} effects": row for name, row in (searched or {}).items()}}
     parts = [
-        "# Why trials failed", "Written by `benchmarks/deploy/explain.py`; do not edit.", INTRODUCTION, NOTES,
-        machines(rows), "## Causes named rightly", table(head, summary),
-        "## Missing effects", effects, table(["hidden", "named first", "verdict", "seconds"], answers), "## Cases",
+        "# Why trials failed", "Written by `benchmarks/deploy/explain.py`; do not edit.", INTRODUCTION,
+        machines(measured), "## Causes named rightly", "Cases measured with the present search for errors of poses:",
+        table([*head, "the same cases before"], compared), without,
+        "All cases, each by its latest row, so those of the search before where none is of the present one:",
+        table(head, summary), "## Missing effects", effects,
+        table(["hidden", "named first", "verdict", "seconds"], answers), "## Cases",
+        "A case with an entry under *before* is of the present search, and that is what the one before found.",
         table(columns, detail),
     ]  # fmt: skip
     return "\n\n".join(part.strip() for part in parts)
