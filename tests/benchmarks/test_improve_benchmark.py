@@ -28,6 +28,7 @@ def test_the_page_sets_the_arms_side_by_side() -> None:
     text = page(rows(60))
     assert "1 of 1 cases and seeds with all arms count" in text
     assert "| rounds | 90 of 100 | 83% to 94% | 94%, at least 94% |" in text
+    assert "| backlash=0.015 | 1 | 60.0%, 60% to 60% | 70.0%, 70% to 70% | 96.0%, 96% to 96% | 1 of 1 | 1 |" in text
     assert "| backlash=0.015 | 1 | 60% (60 of 100) | 90% (90 of 100) | - | - | 1 of 1 |" in text
     assert "| backlash=0.015 | 1 | 60.0% | backlash | 60 of 100, 90 of 100 | 90.0% |" in text
 

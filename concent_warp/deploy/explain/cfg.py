@@ -117,6 +117,9 @@ class JudgeCfg:
     least_failures: Share = 0.5
     """Share of the failure rate of the trials that the policy's own simulation must show, where replays agree and it
     succeeds from most starts, for the policy to be the cause [-]: it fails now and then."""
+    rate_trials: Count = 24
+    """Most trials, drawn from failed and successful ones, from whose starts the policy's failure rate in its own
+    simulation is counted, where replays agree and it succeeds from most starts of failed trials."""
     credible_start: Positive = 2.0
     """Misfit up to which measured starts are credible [-]; noise alone leaves about 1. Where the policy fails in
     simulation from such starts, no error of the tracked poses is searched for."""
@@ -141,9 +144,6 @@ class ExplainCfg:
     """Most failed trials that are explained, the first ones."""
     successes: Annotated[int, Bounds(0, 10_000)] = 4
     """Most successful trials whose free motion is judged besides: failed ones may have little of it."""
-    rate_trials: Count = 24
-    """Most trials, drawn from failed and successful ones, from whose starts the policy's failure rate in its own
-    simulation is counted, where replays agree and it succeeds from most starts of failed trials."""
     simulated: Count = 24
     """Simulated trials that the others are compared with; of few, a single trial that differs is not significant."""
     diagnose: bool = True

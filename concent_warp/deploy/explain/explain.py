@@ -185,7 +185,7 @@ class _Explaining:
         every = [d for r in self._recordings for d in r.demonstrations]
         if self._failed == len(every):  # nothing is known of how often it fails
             return evidence
-        count = min(self._cfg.rate_trials, len(every))
+        count = min(self._cfg.judge.rate_trials, len(every))
         drawn = np.random.default_rng(self._cfg.seed).permutation(len(every))[:count]
         starts = [t.start for t in self._preparation.usable([every[k] for k in sorted(drawn)])]
         found = self._simulate(starts, 0.8, 0.95).success
