@@ -79,12 +79,13 @@ Rounds of 50 iterations of 4,096 worlds, half of those that the given policy was
 measured, with magnitudes under which that policy succeeds in about half of 60 trials of other seeds; some seeds of the
 delay are below 40 % in the common trials.
 
-Seeds 605 to 614, 100 common trials: the arms *true effect* and *randomised* are complete. Of 20 rounds that were begun
-13 had their cause before the host's time ended, after 15 to 25 minutes of two of its slow processors each, beside other
-work: the effect in 12, in one `stribeck_friction`, which is the hidden friction at the speeds of these motions, 2.8 to
-2.9 N m for 3. Seven came to second trials, of which 409 of 420 succeed, and the policies of two were judged in the
-common trials. The seven without a cause count as not named. What was read from the folders of rounds that were cut off
-was entered into the data by hand. Trials of the given policy in ten of these seeds ran on another machine.
+Seeds 605 to 614, revision `a7047a74`, 100 common trials: the arms *true effect* and *randomised* are complete. Of 20
+rounds that were begun 13 had their cause before the host's time ended, after 18 to 27 minutes of two of its slow
+processors each, beside other work: the effect in 12, in one `stribeck_friction`, which is the hidden friction at the
+speeds of these motions, 2.8 to 2.9 N m for 3. Seven came to second trials, of which 409 of 420 succeed, and the
+policies of two were judged in the common trials. The seven without a cause count as not named. What was read from the
+folders of rounds that were cut off was entered into the data by hand. Trials of the given policy in ten of these
+seeds ran on another machine.
 
 Seeds 600 to 604 were measured before, with revision `f0873049` and 200 common trials, up to the second trials; the last
 policies of three were judged. In one of ten the wrong effect was named, play for friction, from the free motion of four
