@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -149,7 +149,7 @@ def main(args: Args) -> None:
     with ProcessPoolExecutor(max(1, args.jobs), get_context("spawn"), _begin, (devices,)) as pool:
         running: dict[Future[dict[str, Any]], tuple[str, int, Arm]] = {}
 
-        def begin(one: tuple[str, int, Arm], iterations: int = 0) -> None:
+        def begin(one: tuple[str, int, Arm], iterations: int) -> None:
             running[pool.submit(study, *one, args, iterations)] = one
 
         def longer(one: tuple[str, int]) -> None:
@@ -283,8 +283,9 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
         "*Before* and *judged*: the given and the last policy in the trials that are the same for all arms.",
         table(["hidden effect", "seed", "before", "named", "trials of each round", "judged"], _by_seed(rows, rates)),
         "## With and without the effect",
-        "The given policy, and trained on for one round each, in the seeds that have all three: mean, smallest and "
-        "largest success. *p*: of *true effect* against *randomised*, seeds in pairs, signed-rank test.",
+        "The given policy, and trained on for one round each, or as long as the rounds of that seed, in the seeds that "
+        "have all three: mean, smallest and largest success. *p*: of *true effect* against *randomised*, seeds in "
+        "pairs, signed-rank test.",
         table(TRAININGS, _trainings(rates)),
         "## Against other trainings", f"{len(counted)} of {len(whole)} cases and seeds with all arms count.",
         table(SUMMARY, _summary(rows, counted)) if counted else "",
@@ -331,11 +332,18 @@ def _trainings(rates: Mapping[tuple[str, int], Mapping[str, float]]) -> list[lis
         mine = [of for (name, _), of in rates.items() if name == case and set(arms) <= set(of)]
         if not mine:
             continue
-        cells = [f"{mean(v):.1%}, {min(v):.0%} to {max(v):.0%}" for arm in arms if (v := [of[arm] for of in mine])]
-        above = sum(of["true effect"] > of["randomised"] for of in mine)
-        test: Any = wilcoxon([of["true effect"] - of["randomised"] for of in mine], alternative="two-sided")
-        lines.append([case, str(len(mine)), *cells, f"{above} of {len(mine)}", f"{test.pvalue:.2g}"])
+        rates_of = {arm: [of[arm] for of in mine] for arm in arms}
+        cells = [f"{mean(v):.1%}, {min(v):.0%} to {max(v):.0%}" for v in rates_of.values()]
+        gain = [of["true effect"] - of["randomised"] for of in mine]
+        above, test = sum(one > 0 for one in gain), _signed_rank(gain)
+        lines.append([case, str(len(mine)), *cells, f"{above} of {len(mine)}", f"{test:.2g}"])
     return lines
+
+
+def _signed_rank(differences: Sequence[float]) -> float:
+    """Return the two-sided p value of Wilcoxon's signed-rank test of paired differences."""
+    found: Any = wilcoxon(differences)
+    return float(found.pvalue)
 
 
 def _summary(rows: Mapping[str, Mapping[str, Any]], counted: Mapping[tuple[str, int], Any]) -> list[list[str]]:

@@ -71,8 +71,7 @@ stated as such and count as one, and the diagnosis was worked on elsewhere. All 
 seeds. The figures are of revision `a7047a74`, all 40 diagnoses at once, one process each, beside other work; two from
 video, *grasp, mass* and *push, sliding_friction*, had named the effect but were not settled in time. A variant that
 searches lost bodies sooner was dropped: on two tumbles of other seeds it took a wrong pose of the half sunken body and
-never left it. A tumbling body
-that was lost may come back as one of its turns, without notice.
+never left it. A tumbling body that was lost may come back as one of its turns, without notice.
 """
 
 

@@ -212,3 +212,21 @@ def test_a_trial_that_agrees_is_the_policys_where_that_fails_from_the_other_star
     differing = replace(of_both, misfit=np.array([1.0, 9.0]))
     found = Judge(policy, policy.run.task(), JudgeCfg()).explanation(differing, ["a", "b"], 2, 2)
     assert [t.cause for t in found.trials] == ["policy", "unexplained"]
+
+
+def test_failures_are_counted_in_all_trials_and_in_the_own_simulation_from_their_starts(
+    policy: cw.Policy, tmp_path: Path
+) -> None:
+    result = cw.evaluate(policy, episodes=3, record=tmp_path)
+    assert result.recorded is not None
+    assert result.success.all()
+    recording = cw.load_recording(result.recorded)
+    first, *others = recording.demonstrations
+    recording = replace(recording, demonstrations=(replace(first, success=False), *others))
+    settings = cw.ExplainCfg(repetitions=1, simulated=3, judge=JudgeCfg(rate_trials=2))
+    rates = _Explaining(policy, [recording], settings, ignore_progress, None)._with_rates(evidence()).rates
+    assert rates is not None
+    assert (rates.failed, rates.trials, rates.simulated) == (1, 3, 2)
+    assert not rates.agree(JudgeCfg())
+    failed = replace(recording, demonstrations=recording.demonstrations[:1])
+    assert _Explaining(policy, [failed], settings, ignore_progress, None)._with_rates(evidence()).rates is None

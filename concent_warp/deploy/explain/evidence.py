@@ -184,8 +184,8 @@ class Judge:
         return {
             "success in own simulation": evidence.own.rate,
             "success with the cause in it": None if evidence.with_cause is None else evidence.with_cause.rate,
-            "failure rate of the trials": None if (rates := evidence.rates) is None else rates.failed / rates.trials,
-            "failure rate in own simulation": None if rates is None else rates.simulated_failed / rates.simulated,
+            "failure rate of the trials": None if evidence.rates is None else evidence.rates.rate,
+            "failure rate in own simulation": None if evidence.rates is None else evidence.rates.simulated_rate,
             "misfit": float(np.median(evidence.misfit)),
             "misfit of simulated trials": evidence.level,
             "misfit that agrees": self.limit(evidence),

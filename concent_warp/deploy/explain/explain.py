@@ -188,6 +188,8 @@ class _Explaining:
         count = min(self._cfg.judge.rate_trials, len(every))
         drawn = np.random.default_rng(self._cfg.seed).permutation(len(every))[:count]
         starts = [t.start for t in self._preparation.usable([every[k] for k in sorted(drawn)])]
+        if not starts:
+            return evidence
         found = self._simulate(starts, 0.8, 0.95).success
         rates = FailureRates(self._failed, len(every), int((~found).sum()), found.size)
         return replace(evidence, rates=rates)

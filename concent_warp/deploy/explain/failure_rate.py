@@ -23,16 +23,23 @@ class FailureRates:
     simulated: int
     """All simulated episodes."""
 
+    @property
+    def rate(self) -> float:
+        """Share of the trials that failed."""
+        return self.failed / self.trials
+
+    @property
+    def simulated_rate(self) -> float:
+        """Share of the simulated episodes that failed."""
+        return self.simulated_failed / self.simulated
+
     def agree(self, cfg: JudgeCfg) -> bool:
         """Return whether the policy fails about as often in its own simulation.
 
         It does where failures are not significantly more frequent in the trials, by Fisher's exact test, and the rate
         of the simulation is a relevant share of theirs: few trials alone would never be significant.
         """
-        if not self.simulated_failed:
-            return False
-        rate = self.failed / self.trials
-        if self.simulated_failed / self.simulated < cfg.least_failures * rate:
+        if not self.simulated_failed or self.simulated_rate < cfg.least_failures * self.rate:
             return False
         counts = [
             [self.failed, self.trials - self.failed],
