@@ -68,7 +68,7 @@ def _polynomial_signals(
             return None
         time, position, quaternion = _tracked_pose(target)
         place, turned = Channel(time, position), Channel(time, quaternion)
-    linear, angular = _velocity_channels(scene.model, demonstration, body)
+    linear, angular = velocity_channels(scene.model, demonstration, body)
     signal, orientation = cfg.signal(place, linear), cfg.orientation(turned, angular)
     return None if signal is None or orientation is None else (signal, orientation)
 
@@ -80,7 +80,7 @@ def _tracked_pose(target: BodyTarget) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return target.time[seen], pose[seen, :3], pose[seen, 3:]
 
 
-def _velocity_channels(
+def velocity_channels(
     m: mujoco.MjModel, demonstration: Demonstration, body: str
 ) -> tuple[Channel | None, Channel | None]:
     """Return the measured velocity [m/s, world] and angular velocity [rad/s, body frame] of a body's frame."""

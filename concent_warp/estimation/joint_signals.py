@@ -119,10 +119,8 @@ def coupled_joints(
         min_singular: Smallest singular value of equations that determine all joints.
 
     Raises:
-        RecordingError: The measurements do not determine a joint, or there is a ball joint.
+        RecordingError: The measurements do not determine a joint.
     """
-    if (m.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)).any():
-        raise RecordingError("windows cannot start in a scene with ball joints", where=demonstration.name)
     joints = np.flatnonzero(np.isin(m.jnt_type, HINGE_OR_SLIDE))
     column = {int(joint): i for i, joint in enumerate(joints)}
     by_dof = {joint.dof: joint.position for joint in measured}

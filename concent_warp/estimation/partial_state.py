@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.estimation.ball_signals import ball_signals
 from concent_warp.estimation.joint_signals import joint_rates, joint_signals
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.object_tracks import frame_channel
@@ -56,6 +57,10 @@ def partial_state(
     if demonstration.qvel is None or time > 0.0:
         for joint, rate in joint_rates(m, demonstration, cfg).items():
             qvel[m.jnt_dofadr[joint]] = rate.estimate(at).value[0, 0]
+    for ball in ball_signals(m, demonstration, cfg):
+        seen = ball.orientation.estimate(at)
+        qpos[ball.qpos : ball.qpos + 4], qvel[ball.dof : ball.dof + 3] = seen.quaternion[0], seen.velocity[0]
+        measured[ball.dof : ball.dof + 3] = True
     for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
         body = m.body(int(m.jnt_bodyid[joint])).name
         place, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])

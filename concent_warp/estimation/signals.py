@@ -140,6 +140,20 @@ class MeasuredBody:
     """None if only the position was measured."""
 
 
+@dataclass(frozen=True)
+class MeasuredBall:
+    """A ball joint whose rotation was measured."""
+
+    name: str
+    qpos: int
+    """Address in qpos."""
+    dof: int
+    """Address in qvel."""
+    orientation: OrientationSignal
+    """Rotation from the body on the joint to where it is in the reference pose, with the angular velocity in the frame
+    of the body."""
+
+
 def sample_values_and_rates(
     value: np.ndarray, rate: np.ndarray, covariance: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:

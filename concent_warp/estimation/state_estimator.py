@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.ball_signals import BALL, ball_signals
 from concent_warp.estimation.body_signals import polynomial_bodies, spline_bodies
 from concent_warp.estimation.joint_signals import HINGE_OR_SLIDE, CoupledJoints, coupled_joints, joint_signals
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
-from concent_warp.estimation.signals import MeasuredBody, MeasuredJoint, OrientationSignal, Signal
+from concent_warp.estimation.signals import MeasuredBall, MeasuredBody, MeasuredJoint, OrientationSignal, Signal
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.simulate.replay import commands, initial_state, interpolate, replay, step_count
 
@@ -100,6 +101,8 @@ class StateEstimator:
     """All hinges and slides, with those that follow from tendons and equalities; None for smoothing splines."""
     simulated: SimulatedTrajectory | None
     """States of what was not measured; None if everything was."""
+    balls: tuple[MeasuredBall, ...] = ()
+    """Ball joints whose rotation was measured."""
 
     @staticmethod
     def of(
@@ -151,7 +154,12 @@ class StateEstimator:
         found: list[Signal | OrientationSignal] = []
         found += [j.position for j in self.joints] if self.coupled is None else list(self.coupled.readings)
         found += [b.position for b in self.bodies]
-        return found + [b.orientation for b in self.bodies if b.orientation is not None]
+        return found + [signal for _, _, signal in self._turning()]
+
+    def _turning(self) -> list[tuple[int, int, OrientationSignal]]:
+        """Return what turns about all axes, each by the addresses of its quaternion and of its angular velocity."""
+        bodies = [(b.qpos + 3, b.dof + 3, b.orientation) for b in self.bodies if b.orientation is not None]
+        return [*bodies, *((b.qpos, b.dof, b.orientation) for b in self.balls)]
 
     def states(self, time: np.ndarray) -> MeasuredStates:
         """Return the estimated states at `time` (T,) [s]."""
@@ -172,11 +180,10 @@ class StateEstimator:
             linear = slice(body.dof, body.dof + 3)
             qpos[:, body.qpos : body.qpos + 3] = found.value
             qvel[:, linear], qacc[:, linear] = found.rate, found.second
-            if body.orientation is not None:
-                turn = body.orientation.estimate(time)
-                angular = slice(body.dof + 3, body.dof + 6)
-                qpos[:, body.qpos + 3 : body.qpos + 7] = turn.quaternion
-                qvel[:, angular], qacc[:, angular] = turn.velocity, turn.acceleration
+        for place, dof, orientation in self._turning():
+            turn, angular = orientation.estimate(time), slice(dof, dof + 3)
+            qpos[:, place : place + 4] = turn.quaternion
+            qvel[:, angular], qacc[:, angular] = turn.velocity, turn.acceleration
         return MeasuredStates(qpos, qvel, qacc)
 
     def standard_errors(self, time: np.ndarray) -> StateErrors:
@@ -188,10 +195,9 @@ class StateEstimator:
         else:
             for joint in self.joints:
                 variance[:, joint.dof] = np.einsum("tii->ti", joint.position.covariance(time))
-        for body in self.bodies:
-            for start, signal in ((body.dof, body.position), (body.dof + 3, body.orientation)):
-                if signal is not None:
-                    variance[:, start : start + 3] = np.einsum("tii->ti", signal.covariance(time))[:, None]
+        positions = [(body.dof, body.position) for body in self.bodies]
+        for start, signal in (*positions, *((dof, signal) for _, dof, signal in self._turning())):
+            variance[:, start : start + 3] = np.einsum("tii->ti", signal.covariance(time))[:, None]
         return StateErrors(*np.sqrt(variance).transpose(2, 0, 1))
 
     def sample_states(
@@ -218,10 +224,8 @@ class StateEstimator:
         for body in self.bodies:
             position, velocity = body.position.sample(time, count, rng)
             qpos[:, :, body.qpos : body.qpos + 3], qvel[:, :, body.dof : body.dof + 3] = position, velocity
-            if body.orientation is not None:
-                quaternion, spin = body.orientation.sample(time, count, rng)
-                qpos[:, :, body.qpos + 3 : body.qpos + 7] = quaternion
-                qvel[:, :, body.dof + 3 : body.dof + 6] = spin
+        for place, dof, orientation in self._turning():
+            qpos[:, :, place : place + 4], qvel[:, :, dof : dof + 3] = orientation.sample(time, count, rng)
         return qpos, qvel
 
     def scatter(self, time: np.ndarray, *, both_sides: bool = False) -> np.ndarray:
@@ -272,13 +276,22 @@ def _by_polynomials(scene: Scene, demonstration: Demonstration, cfg: StateEstima
     """Return an estimator by local polynomials.
 
     Raises:
-        RecordingError: A joint or a free body was not measured, or there is a ball joint.
+        RecordingError: A joint or a free body was not measured.
     """
     m = scene.model
+    balls = ball_signals(m, demonstration, cfg.polynomial)
+    if len(balls) < np.count_nonzero(m.jnt_type == BALL):
+        raise RecordingError(
+            "a window cannot start where a ball joint was not measured",
+            where=demonstration.name,
+            expected="sensors of its rotation (ballquat), or of the orientation of the body on it (framequat)",
+            found=[b.name for b in balls],
+            fix="record them, or fit whole demonstrations",
+        )
     bodies = polynomial_bodies(scene, demonstration, cfg.polynomial, initial_state(m, demonstration)[0])
     joints = joint_signals(m, demonstration, cfg.polynomial)
     coupled = coupled_joints(m, demonstration, cfg.polynomial, joints, cfg.min_singular)
-    return StateEstimator(cfg, m, joints, bodies, coupled, None)
+    return StateEstimator(cfg, m, joints, bodies, coupled, None, balls)
 
 
 def _by_splines(
@@ -291,14 +304,15 @@ def _by_splines(
     """
     m = model.compile() if engine is None else engine.compiled
     joints, bodies = joint_signals(m, demonstration, cfg.spline), spline_bodies(m, demonstration, cfg.spline)
-    if not joints and not bodies:
+    balls = ball_signals(m, demonstration, cfg.spline)
+    if not (joints or bodies or balls):
         raise RecordingError(
             "no measured motion",
             where=demonstration.name,
-            expected=f"{cfg.spline.min_readings} readings of a joint's (jointpos) or a free body's (framepos) position",
+            expected=f"{cfg.spline.min_readings} readings of a joint (jointpos, ballquat) or of a free body's framepos",
             found=sorted(demonstration.measured),
         )
-    covered = len(joints) + sum(3 + 3 * (b.orientation is not None) for b in bodies)
+    covered = len(joints) + 3 * len(balls) + sum(3 + 3 * (b.orientation is not None) for b in bodies)
     simulated = None
     if engine is not None:
         simulated = _simulated(model, demonstration, engine, complete=covered == m.nv)
@@ -307,9 +321,9 @@ def _by_splines(
             "some joints or free bodies were not measured",
             where=demonstration.name,
             expected="positions of all of them, or an engine that simulates the others",
-            found=[j.name for j in joints] + [b.name for b in bodies],
+            found=[one.name for one in (*joints, *bodies, *balls)],
         )
-    return StateEstimator(cfg, m, joints, bodies, None, simulated)
+    return StateEstimator(cfg, m, joints, bodies, None, simulated, balls)
 
 
 def _simulated(model: Model, demonstration: Demonstration, engine: Engine, *, complete: bool) -> SimulatedTrajectory:

@@ -309,6 +309,8 @@ def start_spread(
     seen_bodies = {frame.body for frame in frames.values()}
     position, velocity = np.full(m.nv, cfg.unmeasured_position), np.full(m.nv, cfg.unmeasured_velocity)
     if measured is not None:
+        for dof in (dof for body in seen_bodies for dof in _ball_dofs(m, body)):
+            position[dof : dof + 3], velocity[dof : dof + 3] = cfg.unknown_orientation, cfg.unknown_spin
         for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
             dof = int(m.jnt_dofadr[joint])
             if measured[dof : dof + 6].any() or int(m.jnt_bodyid[joint]) in seen_bodies:
@@ -334,6 +336,9 @@ def start_spread(
             seen(slice(dof, dof + 1), std)
         elif kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL):
             rates[int(m.jnt_dofadr[target])] = cfg.state_noise * std
+        elif kind == int(mujoco.mjtSensor.mjSENS_BALLQUAT):
+            dof = int(m.jnt_dofadr[target])
+            seen(slice(dof, dof + 3), std)
         elif kind == int(mujoco.mjtSensor.mjSENS_TENDONPOS):
             first = m.tendon_adr[target]
             for w in range(first, first + m.tendon_num[target]):
@@ -343,12 +348,14 @@ def start_spread(
         elif kind in (int(mujoco.mjtSensor.mjSENS_FRAMEPOS), int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)):
             if row not in frames:
                 continue
-            joint = int(m.body_jntadr[frames[row].body])
+            turns, joint = kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(m.body_jntadr[frames[row].body])
             if joint < 0 or m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
-                for dof, lever in _levers(m, frames[row], turn=kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)).items():
+                for dof in _ball_dofs(m, frames[row].body) if turns else ():
+                    seen(slice(dof, dof + 3), std)
+                for dof, lever in _levers(m, frames[row], turn=turns).items():
                     told[dof] = min(told.get(dof, np.inf), std / lever)
                 continue
-            dof = int(m.jnt_dofadr[joint]) + 3 * (kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
+            dof = int(m.jnt_dofadr[joint]) + 3 * turns
             seen(slice(dof, dof + 3), std)
     for dof in told.keys() - shown:  # joints without a sensor of their own
         seen(slice(dof, dof + 1), told[dof])
@@ -356,6 +363,13 @@ def start_spread(
         if measured is not None and not measured[dof]:
             velocity[dof] = std
     return np.concatenate([position, velocity])
+
+
+def _ball_dofs(m: mujoco.MjModel, body: int) -> list[int]:
+    """Return the first degree of freedom of each ball joint of a body."""
+    first = int(m.body_jntadr[body])
+    joints = range(first, first + int(m.body_jntnum[body]))
+    return [int(m.jnt_dofadr[j]) for j in joints if m.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
 
 
 def _levers(m: mujoco.MjModel, frame: SensorFrame, *, turn: bool) -> dict[int, float]:
