@@ -55,8 +55,10 @@ def _number(value: float) -> str:
 
 def value_and_interval(p: FittedParameter) -> str:
     """Return a parameter as text, such as ``torque 0.0301 [0.0298, 0.0305] N m``; its owner in brackets is left out."""
-    unit = "" if p.unit == "-" else f" {p.unit}"
-    return f"{p.name.split('[')[0]} {_number(p.value)} [{_number(p.low)}, {_number(p.high)}]{unit}"
+    from concent_warp.effects.effect import with_unit
+
+    text = f"{p.name.split('[')[0]} {_number(p.value)} [{_number(p.low)}, {_number(p.high)}]"
+    return with_unit(text, p.unit)
 
 
 def say_fitted(fitted: FittedEffects) -> None:

@@ -12,6 +12,7 @@ from concent_warp.comparison.units import p_value_text
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
 from concent_warp.diagnosis.replayed import Replayed
 from concent_warp.diagnosis.result_html import diagnosis_html
+from concent_warp.effects.effect import with_unit
 from concent_warp.effects.table import posteriors_table
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
@@ -387,12 +388,12 @@ class Diagnosis:
         if self.verdict == "none_needed":
             said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise.")
             if self.detectable:
-                shown = "; ".join(f"{d.name} {d.size:.2g} {d.unit}" for d in self.detectable[:6])
+                shown = "; ".join(with_unit(f"{d.name} {d.size:.2g}", d.unit) for d in self.detectable[:6])
                 said.append(f"Smallest detectable sizes: {shown}.")
         for k, finding in enumerate(self.accepted):
             group = self.groups[k] if k < len(self.groups) else (finding.name,)
             values = ", ".join(
-                f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}] {p.unit}" for p in finding.parameters[:4]
+                with_unit(f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}]", p.unit) for p in finding.parameters[:4]
             )
             lead = "Missing" if k == 0 else "Then missing"
             lead = "The best so far" if self.verdict == "unsettled" else lead

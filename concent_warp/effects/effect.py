@@ -47,6 +47,11 @@ PHASE_ERROR = 0.25
 at its end as if it had acted from its beginning, half a step early, which is the 95 % interval."""
 
 
+def with_unit(text: str, unit: str) -> str:
+    """Return a number in words with its unit after it, which may be "-" for none."""
+    return text if unit == "-" else f"{text} {unit}"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number of an effect.

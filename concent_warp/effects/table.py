@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.documents import is_number
-from concent_warp.effects.effect import AddedEffect, Effect
+from concent_warp.effects.effect import AddedEffect, Effect, with_unit
 from concent_warp.effects.posterior import JointPosterior
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError
@@ -44,7 +44,7 @@ def checked_values(
         if not (parameter.low <= value <= parameter.high or value == parameter.null):
             raise ModelError(
                 f"{effect.name}: {parameter.name} is out of bounds",
-                expected=f"{parameter.low:g} to {parameter.high:g} {parameter.unit}",
+                expected=with_unit(f"{parameter.low:g} to {parameter.high:g}", parameter.unit),
                 found=value,
             )
     return tuple(float(value) for value in values)

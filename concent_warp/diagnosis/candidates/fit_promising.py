@@ -75,6 +75,8 @@ class CandidateFits:
         expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in pairs])
         if expected.max() < self.cfg.min_gain:  # none explains enough to be accepted, however well it is fitted
             return self.fits
+        if self._best().share(self.base) < self.search.stuck_share * least_promise:
+            return self.fits  # what was expected of them is not there
         added = self._continue_from_first_parts(screened, short_windows)
         expected = np.maximum(np.pad(expected, (0, added)), [c.share(self.base) for c in self.fits])
         self._search_values()

@@ -106,7 +106,7 @@ class AdditionFinder:
         least = self._least_promise(base)
         fits = CandidateFits(base, cfg, context.runner)
         fitted = fits.fit(screened, needed, short_windows, least)
-        if parts and self._leaves_more(base, fitted):
+        if parts and context.record.provisional is None and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
             fitted = fits.fit(more, max(critical, cfg.min_gain), short_windows, least)

@@ -18,7 +18,7 @@ from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.diagnosis.search.nominal_values import possible_nominal_effects
 from concent_warp.diagnosis.suggestion.cfg import SuggestCfg
 from concent_warp.documents import is_number, read_json
-from concent_warp.effects.effect import AddedEffect
+from concent_warp.effects.effect import AddedEffect, with_unit
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.fit import fit_effects
@@ -161,7 +161,7 @@ def fitted_hypotheses(
     for value in (low, high):
         values = (*added.values[:k], float(value), *added.values[k + 1 :])
         effects = (*one.effects[:effect], replace(added, values=values), *one.effects[effect + 1 :])
-        label = f"{parameter.name} = {value:.3g}{'' if parameter.unit == '-' else ' ' + parameter.unit}"
+        label = with_unit(f"{parameter.name} = {value:.3g}", parameter.unit)
         found.append(Hypothesis(label, replace(one, effects=effects), spread))
     return found
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from concent_warp.checks import Share, WindowLength, check_settings
+from concent_warp.effects.effect import with_unit
 from concent_warp.effects.posterior import JointPosterior
 from concent_warp.errors import ModelError
 from concent_warp.estimation.noise_ratio import noise_ratio
@@ -309,7 +310,8 @@ def _remarks(
     unknown = set()
     for k, (q, prior) in enumerate(zip(parameters, solver.p.parameters, strict=True)):
         if q.at_bound:
-            found.append(f"{q.name} ended on its bound, {q.value:g} {q.unit}: what is missing may be something else.")
+            value = with_unit(f"{q.value:g}", q.unit)
+            found.append(f"{q.name} ended on its bound, {value}: what is missing may be something else.")
         width = q.high - q.low
         if (
             width > 2 * NORMAL_QUANTILE * cfg.undetermined_share * cfg.least_squares.prior * prior.scale
