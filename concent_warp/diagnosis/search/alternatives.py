@@ -44,7 +44,9 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
     tried = [r for r in rivals if r.finding.name in equals]
     others = [r for r in rivals if r.finding.name not in equals and r.finding.p <= cfg.significance_level]
     for count in range(_most(cfg.search)):
-        enough = count >= cfg.search.alternatives and any(_reaches_noise(context, found[-1]) for found, _ in answers)
+        ends = [found[-1] for found, _ in answers]
+        far = all(end.ratio > cfg.search.far_ratio for end in ends)
+        enough = count >= cfg.search.alternatives and (far or any(_reaches_noise(context, end) for end in ends))
         if not others or enough:
             break
         rival = others.pop(0)

@@ -181,6 +181,13 @@ def test_candidates_below_a_least_promise_are_not_fitted(monkeypatch):
         assert [c.name for c in found] == list(fitted)
 
 
+@pytest.mark.parametrize(("gain", "refined"), [(0.19, False), (0.21, True)])
+def test_fits_that_gain_less_than_half_of_a_least_promise_are_not_refined(monkeypatch, gain, refined):
+    tasks = Tasks(monkeypatch, {"a": made("a", gain, ratio=1.3)})
+    assert [c.name for c in fits_of([]).fit([screened("a", 0.5)], 0.1, list, 0.4)] == ["a"]
+    assert (len(tasks.done) > 1) is refined
+
+
 def test_candidates_of_which_a_scanned_value_gains_something_may_promise_less(monkeypatch):
     assert (SearchCfg().min_expected_gain, SearchCfg().min_scanned_gain) == (0.5, 0.25)
     for expected, scanned_gain, fitted in ((0.051, 0.0, "a"), (0.049, 0.0, ""), (0.049, 0.01, "a"), (0.024, 0.01, "")):

@@ -167,7 +167,9 @@ def test_a_single_effect_that_leaves_more_than_noise_has_alternatives(monkeypatc
     assert tried == [["actuator_lag"]]
 
 
-def begun_from(greedy: tuple[Procedure, list[FittedModel]], monkeypatch, *, noisy: bool, parallel: bool) -> list[str]:
+def begun_from(
+    greedy: tuple[Procedure, list[FittedModel]], monkeypatch, *, noisy: bool, parallel: bool, far_ratio: float = 20.0
+) -> list[str]:
     """Return the rivals from which a search is continued.
 
     Args:
@@ -175,8 +177,10 @@ def begun_from(greedy: tuple[Procedure, list[FittedModel]], monkeypatch, *, nois
         monkeypatch: Of the test.
         noisy: Whether all answers leave more than noise.
         parallel: Whether the second rival takes from the residuals what the first one takes.
+        far_ratio: Setting of the search.
     """
     made, begun = resumed(greedy, 1), []
+    made.context.cfg = replace(made.context.cfg, search=replace(made.context.cfg.search, far_ratio=far_ratio))
     axes = np.eye(2)
     removed = {"actuator_lag": axes[0], "actuator_delay": axes[0], "joint_damping": axes[0 if parallel else 1]}
     rivals = tuple(replace(r, removed=removed[r.finding.name]) for r in made.record.rivals[0])
@@ -193,6 +197,14 @@ def test_more_rivals_are_tried_while_all_answers_leave_more_than_noise(greedy, m
     with monkeypatch.context() as patch:
         assert begun_from(greedy, patch, noisy=False, parallel=False) == ["actuator_delay"]
     assert begun_from(greedy, monkeypatch, noisy=True, parallel=False) == ["actuator_delay", "joint_damping"]
+
+
+def test_one_rival_is_enough_where_all_answers_are_far_off(greedy, monkeypatch):
+    last = greedy[1][-1].ratio
+    with monkeypatch.context() as patch:
+        found = begun_from(greedy, patch, noisy=True, parallel=False, far_ratio=0.5 * last)
+        assert found == ["actuator_delay"]
+    assert len(begun_from(greedy, monkeypatch, noisy=True, parallel=False, far_ratio=1.1 * last)) == 2
 
 
 def test_a_rival_that_takes_away_what_an_earlier_one_does_is_not_tried(greedy, monkeypatch):

@@ -388,6 +388,13 @@ def test_beside_a_provisional_addition_candidates_must_promise_what_it_left():
     assert made.additions.finder._least_promise(node(0.9)) == 0
 
 
+def test_parts_are_no_candidates_beside_what_may_be_errors_in_formulas(monkeypatch):
+    made, parts = procedure(), Parts(monkeypatch, {"whole": (0.7, 1.5), "part": (0.9, 1.0)})
+    made.record.provisional = 0
+    assert parts.find(made)[0] == "whole"
+    assert parts.screened == [["whole", "other"]]
+
+
 def test_parts_of_an_effect_that_was_asked_for_are_candidates_from_the_start(monkeypatch):
     for asked, first in ((("part",), ["whole", "part", "other"]), (("whole",), ["whole", "other"])):
         made, parts = procedure(effects=asked), Parts(monkeypatch, {"whole": (0.7, 1.0)})
