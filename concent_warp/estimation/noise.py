@@ -46,6 +46,14 @@ EVEN = 1e-6
 
 SAME = 1e-6
 """Differences over their scale that are rounding [-]."""
+SAME_LEVEL = 1e-9
+"""Difference of two readings over the range of all that is rounding of numbers [-]."""
+MIN_GAPS = 20
+"""Fewest gaps between readings, most of which never repeat, from which a step is found."""
+STEPS_OF_GAPS = (1, 4, 16, 64, 256, 1024, 4096)
+"""Largest gaps that refine the step, in steps, one after the other."""
+OFF_STEP = 0.1
+"""Distance of a reading from a multiple of the step, over the step, up to which it is one [-]."""
 MAX_CLIPPINGS = 20
 """Steps after which the scale of the smallest differences is settled."""
 
@@ -89,7 +97,8 @@ class Noise:
     source: Source
     """Where it is from."""
     low: float = -np.inf
-    """Lower end of a 95 % interval; `std` where it is stated, 0 where the readings show no noise beside the motion."""
+    """Lower end of a 95 % interval; `std` where it is stated. What the resolution leaves, 0 for readings without steps,
+    where they show no noise beside the motion."""
     high: float = np.inf
     """Upper end: noise that is slow against the sampling may be as large, and not larger."""
 
@@ -202,7 +211,7 @@ def _noise_in_differences(
             std = max(std, float(np.sqrt(max(64 * near**2 - far**2, 0.0) / 63)))
             low, high = values[0], max(high, near, far if far <= most else near)
     error = 2 / np.sqrt(sum(len(piece) for piece in pieces))
-    return Noise(std, "differences", max(low * (1 - error), 0.0), max(high, std) * (1 + error))
+    return Noise(std, "differences", max(low * (1 - error), min(floor, std)), max(high, std) * (1 + error))
 
 
 def _spread(pieces: Sequence[np.ndarray], kind: Kind) -> float:
@@ -306,14 +315,34 @@ def _centred(window: np.ndarray, kind: Kind) -> np.ndarray:
 
 def _resolution(pieces: Sequence[np.ndarray]) -> float:
     """Return the step in which readings come, in their unit; 0 where they do not come in steps."""
-    steps = []
-    for column in np.concatenate(pieces).T:
-        levels = np.unique(column)
-        gaps = np.diff(levels)
-        gaps = gaps[gaps > 1e-9 * np.ptp(column)]
-        if len(gaps) and len(levels) < len(column) / 2:
-            step = float(np.percentile(gaps, 10))
-            multiple = (levels - levels[0]) / step
-            if np.percentile(np.abs(multiple - np.round(multiple)), 95) < 0.05:
-                steps.append(step)
-    return max(steps, default=0.0)
+    return max((_step(column) for column in np.concatenate(pieces).T), default=0.0)
+
+
+def _step(column: np.ndarray) -> float:
+    """Return the step of which readings (n,) are multiples, up to a constant and to digits that a log rounds; else 0.
+
+    Readings of a fast motion hardly ever repeat: the step is about the smallest gap between any two.
+    """
+    levels = np.unique(column)
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > SAME_LEVEL * np.ptp(column)]
+    repeated = len(levels) < len(column) / 2
+    if not len(gaps) or not (repeated or len(gaps) >= MIN_GAPS):
+        return 0.0
+    return max(_refined_step(levels, float(step)) for step in (np.percentile(gaps, 10), gaps.min()))
+
+
+def _refined_step(levels: np.ndarray, step: float) -> float:
+    """Return the step of which sorted levels (n,) are multiples, near a first value; 0 where they are not."""
+    gaps = np.diff(levels)
+    for largest in STEPS_OF_GAPS:
+        count = np.round(gaps / step)
+        near = (count >= 1) & (count <= largest)
+        if near.any():
+            step = float((gaps[near] * count[near]).sum() / (count[near] ** 2).sum())
+    count = np.concatenate([[0.0], np.cumsum(np.round(gaps / step))])
+    if count[-1] == 0:
+        return 0.0
+    slope = float(np.polyfit(count, levels, 1)[0])
+    rest = levels - slope * count
+    return slope if np.percentile(np.abs(rest - np.median(rest)), 95) < OFF_STEP * slope else 0.0

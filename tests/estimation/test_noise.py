@@ -86,6 +86,21 @@ def test_readings_in_steps_err_by_a_step_over_the_root_of_twelve(still):
     assert noise.source == "resolution" or not still
 
 
+@pytest.mark.parametrize("digits", [9, 7, 6])
+def test_steps_of_an_encoder_are_found_in_a_fast_motion_whose_readings_a_log_rounds(digits):
+    step = 2 * np.pi / 8192
+    angle = np.round(20 * np.sin(TIME) / step) * step
+    read = np.array([float(f"{value:.{digits}g}") for value in angle])
+    noise = channel_noise(Channel(TIME, read[:, None]), "joint")
+    assert step / np.sqrt(12) <= noise.std * 1.001 < 1.5 * step
+    assert noise.low >= 0.7 * step / np.sqrt(12)
+
+
+def test_readings_without_steps_have_no_resolution():
+    read = 20 * np.sin(TIME)[:, None] + white(np.random.default_rng(5), (len(TIME), 1))
+    assert channel_noise(Channel(TIME, read), "joint").std == pytest.approx(STD, rel=0.3)
+
+
 def test_a_slow_creep_is_not_rest():
     rng = np.random.default_rng(4)
     creep = 0.02 * TIME[:, None] + white(rng, (len(TIME), 1))
