@@ -159,9 +159,12 @@ class HoldingFriction:
     def sentence(self) -> str:
         """A sentence on the friction."""
         values = " and ".join(f'{name}="{value}"' for name, value in self.settings.items())
+        if self.where == "cones":
+            what = f"friction of contacts depends on the direction, by the simulator's default: with {values} it does not"
+        else:
+            what = f"dry friction in {self.where} creeps, by default constants of the simulator: with {values} it holds"
         return (
-            f"The model's dry friction in {self.where} creeps, by default constants of the simulator: with {values} it "
-            f"holds, and the held-out error falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, "
+            f"The model's {what}, and the held-out error falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, "
             f"{100 * self.high:.0f}]; the diagnosis uses it."
         )
 
@@ -388,7 +391,7 @@ class Diagnosis:
         if self.verdict == "none_needed":
             said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise.")
             if self.detectable:
-                shown = "; ".join(with_unit(f"{d.name} {d.size:.2g}", d.unit) for d in self.detectable[:6])
+                shown = "; ".join(with_unit(f"{d.name} {d.parameter} {d.size:.2g}", d.unit) for d in self.detectable[:6])
                 said.append(f"Smallest detectable sizes: {shown}.")
         for k, finding in enumerate(self.accepted):
             group = self.groups[k] if k < len(self.groups) else (finding.name,)
@@ -397,6 +400,7 @@ class Diagnosis:
             )
             lead = "Missing" if k == 0 else "Then missing"
             lead = "The best so far" if self.verdict == "unsettled" else lead
+            lead = "Explains a part" if self.verdict == "none_of_these" else lead
             said.append(
                 f"{lead}: {finding.name} ({values}). Held-out error falls by {100 * finding.gain:.0f} % "
                 f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."

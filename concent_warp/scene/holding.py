@@ -1,7 +1,8 @@
-"""Dry friction that holds: MuJoCo's numerical constants of friction, where a scene leaves them at their defaults.
+"""Dry friction that holds, and acts alike in all directions, where a scene leaves MuJoCo's constants at their defaults.
 
 MuJoCo's friction is a soft constraint. At its default constants a joint with `frictionloss`, or a body on a slope,
-creeps under load, where a real one stays at rest.
+creeps under load, where a real one stays at rest; and the friction of contacts is limited by a pyramid, so that a body
+that slides meets more or less of it by direction, and presses softer on what it slides on.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import numpy as np
 
 from concent_warp.scene.scene import Scene
 
-Holding = Literal["joints", "contacts"]
-"""Where dry friction acts."""
+Holding = Literal["joints", "cones", "contacts"]
+"""Where dry friction acts; `cones` are those of contacts, which are pyramids by default."""
 TIME_CONSTANT_STEPS = 1.5
 """Time constant of the friction of joints, in time steps; MuJoCo takes at least 2 where it is asked to be safe."""
 FRICTION_IMPEDANCE = 0.99
@@ -27,8 +28,8 @@ IMPRATIO = 10.0
 def with_holding_friction(scene: Scene, where: Holding) -> Scene | None:
     """Return a scene with dry friction that holds in joints or contacts; None where that changes nothing.
 
-    Constants that the MJCF sets stay: of a joint, its class or all joints, and of contacts. Those of contacts are for
-    elliptic cones only.
+    Constants that the MJCF sets stay: of a joint, its class or all joints, and of contacts. Contacts hold by elliptic
+    cones only.
     """
     root, m = ElementTree.fromstring(scene.xml), scene.model
     if where == "joints":
@@ -37,14 +38,31 @@ def with_holding_friction(scene: Scene, where: Holding) -> Scene | None:
         for name, value in joint_constants(scene).items():
             _set_default(root, name, value)
     else:
-        if m.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC or m.opt.impratio != 1.0:
+        constants = contact_constants(scene, where)
+        if not constants:
             return None
-        found = root.findall("option")
-        if not found or any("impratio" in option.attrib for option in found):
-            return None
-        found[-1].set("impratio", f"{IMPRATIO:g}")
+        option = next(reversed(root.findall("option")), None)
+        if option is None:
+            option = ElementTree.Element("option")
+            root.insert(0, option)
+        for name, value in constants.items():
+            option.set(name, value)
     holding = Scene(ElementTree.tostring(root, encoding="unicode"), scene.source)
     return None if where == "joints" and _same_joints(holding.model, m) else holding
+
+
+def contact_constants(scene: Scene, where: Holding) -> dict[str, str]:
+    """Return MJCF options of elliptic cones, and for "contacts" of cones that hold; none where that changes nothing."""
+    options, m = ElementTree.fromstring(scene.xml).findall("option"), scene.model
+    given = {name for option in options for name in option.attrib}
+    touches = bool(m.npair) or bool(((m.geom_contype | m.geom_conaffinity) != 0).any())
+    pyramids = m.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC
+    if not touches or (pyramids and "cone" in given) or not (pyramids or where == "contacts"):
+        return {}
+    if where == "contacts" and ("impratio" in given or m.opt.impratio != 1.0):
+        return {}
+    impratio = {"impratio": f"{IMPRATIO:g}"} if where == "contacts" else {}
+    return {**({"cone": "elliptic"} if pyramids else {}), **impratio}
 
 
 def joint_constants(scene: Scene) -> dict[str, str]:

@@ -87,11 +87,12 @@ def test_a_second_effect_follows_the_first():
 def test_nothing_found_comes_with_what_would_have_been_seen():
     said = diagnosis(verdict="none_needed", effects=(), ratio=(1.02,)).sentences()
     assert said[0] == "No discrepancy detected: residuals are 1.02 x noise."
-    assert "joint_friction 0.002 N m" in said[1]
+    assert "joint_friction torque[hinge] 0.002 N m" in said[1]
 
 
 def test_what_no_effect_explains_is_reported_with_its_share():
     said = diagnosis(verdict="none_of_these", unexplained=0.4, next_experiment=EXPERIMENT).sentences()
+    assert said[0].startswith("Explains a part: joint_friction")
     assert any(s.startswith("40 % of the discrepancy stays unexplained") for s in said)
     assert said[-1] == "Next experiment: swing faster: a and b then differ by 4.0 x noise (angle)."
 

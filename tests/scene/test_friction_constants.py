@@ -59,11 +59,41 @@ def test_joints_without_friction_have_nothing_to_hold_by():
 
 
 @pytest.mark.parametrize(
-    ("option", "held"), [(" cone='elliptic'", True), ("", False), (" cone='elliptic' impratio='3'", False)]
+    ("option", "where", "cone", "impratio"),
+    [
+        (" cone='elliptic'", "contacts", 1, 10.0),
+        ("", "contacts", 1, 10.0),
+        ("", "cones", 1, 1.0),
+        (" impratio='3'", "cones", 1, 3.0),
+    ],
 )
-def test_contacts_hold_by_the_ratio_of_impedances_of_elliptic_cones(option, held):
-    found = with_holding_friction(scene(option=option), "contacts")
-    assert (found is not None) == held
-    if found is not None:
-        assert found.model.opt.impratio == 10.0
-        np.testing.assert_array_equal(found.model.dof_solref, scene().model.dof_solref)
+def test_contacts_hold_by_the_ratio_of_impedances_of_elliptic_cones(option, where, cone, impratio):
+    found = with_holding_friction(scene(option=option), where)
+    assert found is not None
+    assert (found.model.opt.cone, found.model.opt.impratio) == (cone, impratio)
+    assert found.model.opt.timestep == 0.002
+    np.testing.assert_array_equal(found.model.dof_solref, scene().model.dof_solref)
+    assert with_holding_friction(found, where) is None
+
+
+@pytest.mark.parametrize(
+    ("option", "where"),
+    [
+        (" cone='elliptic' impratio='3'", "contacts"),
+        (" impratio='3'", "contacts"),
+        (" cone='pyramidal'", "contacts"),
+        (" cone='pyramidal'", "cones"),
+        (" cone='elliptic'", "cones"),
+    ],
+)
+def test_cones_of_contacts_that_the_mjcf_states_stay(option, where):
+    assert with_holding_friction(scene(option=option), where) is None
+
+
+def test_scenes_without_options_have_elliptic_cones_too_unless_nothing_can_touch():
+    given = Scene(scene().xml.replace("<option timestep='.002'/>", ""))
+    found = with_holding_friction(given, "cones")
+    assert found is not None
+    assert found.model.opt.cone == 1
+    free = Scene(given.xml.replace("<geom size='.1'/>", "<geom size='.1' contype='0' conaffinity='0'/>"))
+    assert with_holding_friction(free, "cones") is None

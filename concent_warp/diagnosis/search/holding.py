@@ -1,7 +1,7 @@
-"""Dry friction that creeps by the simulator's default constants, which must not be taken for a missing effect.
+"""Dry friction that creeps, or depends on direction, by the simulator's default constants: no missing effect.
 
-Where a model leaves these constants at their defaults, the same model with friction that holds is a rival of every
-effect; it has no parameters and therefore comes first where it explains more.
+Where a model leaves these constants at their defaults, the same model with friction that holds, or with elliptic cones,
+is a rival of every effect; it has no parameters and therefore comes first where it explains more.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
 from concent_warp.diagnosis.result import HoldingFriction
 from concent_warp.diagnosis.search.time_step import explains_more, projected_residuals, refitted, renew_defects
 from concent_warp.fit.effects.cross_validation import bootstrap_interval
-from concent_warp.scene.holding import IMPRATIO, Holding, joint_constants, with_holding_friction
+from concent_warp.scene.holding import Holding, contact_constants, joint_constants, with_holding_friction
 from concent_warp.scene.scene import Scene
 
 
@@ -63,5 +63,6 @@ def _finding(base: FittedModel, better: FittedModel, where: Holding, seed: int) 
     """Return what friction that holds changes."""
     gain = base.errors - errors_like(better, base)
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
-    settings = joint_constants(base.model.scene) if where == "joints" else {"impratio": f"{IMPRATIO:g}"}
+    scene = base.model.scene
+    settings = joint_constants(scene) if where == "joints" else contact_constants(scene, where)
     return HoldingFriction(where, settings, float(gain.sum() / max(base.errors.sum(), 1e-12)), low, high)

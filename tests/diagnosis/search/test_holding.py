@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -60,8 +61,6 @@ def driven(own: str = "", creeps: bool = False) -> Recording:
 
 def simulated(model: Model, wanted: np.ndarray) -> np.ndarray:
     """Return the position of the stage at each of the times of its commands, as the model predicts it."""
-    import mujoco
-
     m = model.compile()
     d, every = mujoco.MjData(m), round(m.opt.timestep / STEP)
     at_steps = [0.0]
@@ -117,6 +116,42 @@ def test_nothing_is_missing_from_a_stage_whose_friction_holds(held, tmp_path):
     ratio = compared.summarise("model", "scale").ratio
     assert ratio is not None
     assert ratio < 1.3
+
+
+PUCK = (
+    "<mujoco><option timestep='.002'{cone}/><worldbody><geom type='plane' size='1 1 .1'/><body pos='0 0 .02'>"
+    "<joint name='x' type='slide' axis='1 0 0'/><joint name='y' type='slide' axis='0 1 0'/>"
+    "<joint type='slide' axis='0 0 1'/><geom size='.02' mass='1' friction='.4'/></body></worldbody>"
+    "<actuator><position name='x' joint='x' kp='200' kv='20'/><position name='y' joint='y' kp='200' kv='20'/></actuator>"
+    "<sensor><jointpos name='x' joint='x'/><jointpos name='y' joint='y'/></sensor></mujoco>"
+)
+
+
+def pushed(cone: str) -> Recording:
+    """Return a puck that is pushed along the diagonal of a table, whose friction is limited by such a cone."""
+    rng, time = np.random.default_rng(5), np.arange(0, 2, 0.01)
+    m = mujoco.MjModel.from_xml_string(PUCK.format(cone=cone))
+    d, read = mujoco.MjData(m), np.empty((len(time), 2))
+    wanted = 0.1 * np.sin(3 * time)
+    for k, target in enumerate(wanted):
+        read[k], d.ctrl[:] = d.qpos[:2], target
+        mujoco.mj_step(m, d, nstep=5)
+    read += rng.normal(0, NOISE, read.shape)
+    measured = {name: Channel(time, read[:, [i]], noise_std=NOISE) for i, name in enumerate("xy")}
+    action = {name: Channel(time, wanted) for name in "xy"}
+    return Recording(PUCK.format(cone=""), (Demonstration("d", action=action, measured=measured),))
+
+
+def test_friction_that_depends_on_the_direction_by_default_is_no_effect():
+    cfg = replace(CFG, effects=("sensor_gain", "joint_offset"))  # none of these, where cones are pyramids
+    recording = pushed(" cone='elliptic'")
+    found = cw.diagnose(Model(Scene(recording.scene)), recording, cfg)
+    assert (found.verdict, found.accepted) == ("none_needed", ())
+    (said,) = found.to_json()["holding"]
+    assert (said["where"], said["settings"]) == ("cones", {"cone": "elliptic"})
+    assert any("depends on the direction" in sentence for sentence in found.sentences())
+    base = fitted(pushed(""))
+    assert hold(base, (), CFG) == (base, ())
 
 
 def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any):
