@@ -53,12 +53,12 @@ def _number(value: float) -> str:
     return f"{value:.4g}" if np.isfinite(value) else "none" if value > 0 else "-none"
 
 
-def value_and_interval(p: FittedParameter) -> str:
-    """Return a parameter as text, such as ``torque 0.0301 [0.0298, 0.0305] N m``; its owner in brackets is left out."""
+def value_and_interval(p: FittedParameter, *, owner: bool = False) -> str:
+    """Return a parameter as text, such as ``torque 0.0301 [0.0298, 0.0305] N m``, and its owner if asked."""
     from concent_warp.effects.effect import with_unit
 
-    text = f"{p.name.split('[')[0]} {_number(p.value)} [{_number(p.low)}, {_number(p.high)}]"
-    return with_unit(text, p.unit)
+    name = p.name if owner else p.name.split("[")[0]
+    return with_unit(f"{name} {_number(p.value)} [{_number(p.low)}, {_number(p.high)}]", p.unit)
 
 
 def say_fitted(fitted: FittedEffects) -> None:

@@ -91,6 +91,23 @@ def test_where_nothing_is_missing_nothing_is_saved(swing, tmp_path, capsys):
     assert not out.exists()
 
 
+def test_the_table_names_the_owners_of_parameters_and_shows_those_that_exclude_no_change(swing, capsys, monkeypatch):
+    def three(*given, **more) -> Diagnosis:
+        found = diagnosed(*given, **more)
+        first = found.effects[0]
+        (p,) = first.parameters
+        null = [replace(p, name=f"damping[{name}]", value=0.0, low=0.0) for name in ("shoulder", "elbow")]
+        return replace(found, effects=(replace(first, parameters=(*null, replace(p, name="damping[wrist]"))),))
+
+    monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", three)
+    assert diagnose(swing / "demo.h5") == 0
+    table = capsys.readouterr().out.partition("held-out gain")[2]
+    assert "damping[wrist] 0.0" in table
+    assert "damping[shoulder] 0 " in table
+    assert "damping[elbow]" not in table
+    assert "1 more" in table
+
+
 def test_effects_that_explain_too_little_are_named_and_not_saved(swing, tmp_path, capsys, monkeypatch):
     out = tmp_path / "m.toml"
 
@@ -100,7 +117,7 @@ def test_effects_that_explain_too_little_are_named_and_not_saved(swing, tmp_path
     monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", little)
     assert diagnose(swing / "demo.h5", "--apply", str(out)) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "Missing: joint_damping" in said
+    assert "Explains a part: joint_damping" in said
     assert "The effects above explain too little to be added: the model stays as given." in said
     assert f"The accepted effects explain too little: {out} was not written." in said
     assert not out.exists()

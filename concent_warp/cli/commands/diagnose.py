@@ -29,6 +29,8 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 
+MOST_PARAMETERS = 2
+"""Parameters of an effect that the table shows, those that exclude no change first."""
 MOST_PLACES = 3
 """Places that are named below the verdict."""
 
@@ -167,9 +169,11 @@ def _say_effects(effects: Sequence[Finding]) -> None:
         last = k + 1 == len(ranked) or ranked[k + 1].step != f.step
         first = k == 0 or ranked[k - 1].step != f.step
         verdict = "accepted" if f.accepted else f.reason
-        lines = [f"{f.name}: {verdict}", *(f"  {value_and_interval(p)}" for p in f.parameters[:2])]
-        if len(f.parameters) > 2:
-            lines.append(f"  {len(f.parameters) - 2} more")
+        shown = sorted(f.parameters, key=lambda p: not p.excludes_null)[:MOST_PARAMETERS]
+        several = len(f.parameters) > 1
+        lines = [f"{f.name}: {verdict}", *(f"  {value_and_interval(p, owner=several)}" for p in shown)]
+        if len(f.parameters) > len(shown):
+            lines.append(f"  {len(f.parameters) - len(shown)} more")
         cells = [
             str(f.step + 1) if first else "",
             "\n".join(lines),
