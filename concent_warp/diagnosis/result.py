@@ -160,7 +160,7 @@ class HoldingFriction:
         """A sentence on the friction."""
         values = " and ".join(f'{name}="{value}"' for name, value in self.settings.items())
         if self.where == "cones":
-            what = f"friction of contacts depends on the direction, by the simulator's default: with {values} it does not"
+            what = f"contact friction depends on the direction, by the simulator's default: with {values} it does not"
         else:
             what = f"dry friction in {self.where} creeps, by default constants of the simulator: with {values} it holds"
         return (

@@ -122,7 +122,8 @@ PUCK = (
     "<mujoco><option timestep='.002'{cone}/><worldbody><geom type='plane' size='1 1 .1'/><body pos='0 0 .02'>"
     "<joint name='x' type='slide' axis='1 0 0'/><joint name='y' type='slide' axis='0 1 0'/>"
     "<joint type='slide' axis='0 0 1'/><geom size='.02' mass='1' friction='.4'/></body></worldbody>"
-    "<actuator><position name='x' joint='x' kp='200' kv='20'/><position name='y' joint='y' kp='200' kv='20'/></actuator>"
+    "<actuator><position name='x' joint='x' kp='200' kv='20'/>"
+    "<position name='y' joint='y' kp='200' kv='20'/></actuator>"
     "<sensor><jointpos name='x' joint='x'/><jointpos name='y' joint='y'/></sensor></mujoco>"
 )
 
