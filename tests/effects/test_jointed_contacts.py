@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.effects import select
-from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
+from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction, TorsionalFriction
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 
@@ -53,7 +53,8 @@ def test_bodies_on_joints_that_can_touch_the_same_are_one_selection():
         '<body name="b"><joint/><geom size="0.1" contype="2" conaffinity="2"/></body>',
     )
     assert targets(apart) == (("finger", "door"), ("a", "b"))
-    assert SlidingFriction.targets(compiled()) == ()
+    assert SlidingFriction.targets(compiled()) == targets(compiled())
+    assert TorsionalFriction.targets(compiled()) == ()
 
 
 def test_a_free_body_has_the_contacts_of_the_scene_to_itself():

@@ -137,6 +137,7 @@ class SlidingFriction(FrictionEffect):
     signature = "residual force against sliding, whatever the speed, in proportion to the normal force"
     confusions = ("anisotropic_friction", "mass", "grip_force", "gravity_tilt", "torsional_friction")
     formula_error = FRICTION_SCATTER
+    of_joints = True
     column, condim = SLIDING, 3
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
