@@ -85,6 +85,18 @@ def arm_actuators(m: mujoco.MjModel) -> tuple[str, ...]:
     )
 
 
+def is_thruster(m: mujoco.MjModel, actuator: int) -> bool:
+    """Return whether an actuator pushes or turns a body at a site, as a rotor does."""
+    return m.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_SITE)
+
+
+def thrusters(m: mujoco.MjModel) -> tuple[str, ...]:
+    """Return the names of the actuators that push or turn a body at a site."""
+    return tuple(
+        n for a in range(m.nu) if is_thruster(m, a) and (n := element_name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a))
+    )
+
+
 def each_of_several(selections: Iterable[tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
     """Return each element of the selections that have several, as a selection of its own."""
     return tuple((name,) for names in selections if len(names) > 1 for name in names)

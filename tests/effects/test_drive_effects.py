@@ -30,6 +30,26 @@ def test_gain_scales_what_a_motor_does_and_how_far_a_servo_sags():
     assert sag == pytest.approx(-LOAD / (0.7 * KP), rel=1e-4)
 
 
+ROTORS = """
+<mujoco><option timestep="0.002"/><worldbody><body name="drone"><freejoint/><geom size="0.1" mass="2"/>
+  <site name="left" pos="-0.2 0 0"/><site name="right" pos="0.2 0 0"/></body></worldbody>
+<actuator><motor name="left" site="left" gear="0 0 1 0 0 0"/><motor name="right" site="right" gear="0 0 1 0 0 0"/>
+</actuator></mujoco>"""
+
+
+def test_rotors_may_lack_a_gain_a_delay_and_a_lag_where_no_joints_are_driven():
+    m, both = world(ROTORS).compile(), ("left", "right")
+    for effect in (ActuatorGain, ActuatorDelay, ActuatorLag):
+        assert effect.targets(m) == (both,)
+    for effect in (ActuatorSaturation, Backlash, JointCompliance, GripForce):
+        assert effect.targets(m) == ()
+    fallen = -G * 0.5 + 2 * 5.0 * 0.9 * 0.5 / MASS
+    assert move(world(ROTORS, ActuatorGain(*both), 0.9, 0.9), 0.5, ctrl=5.0).qvel[-1, 2] == pytest.approx(fallen)
+    sticky = ROTORS.replace("</actuator>", "<adhesion name='pull' body='drone' ctrlrange='0 1'/></actuator>")
+    with pytest.raises(ModelError, match="or of sites"):
+        world(sticky, ActuatorDelay("pull"), 0.1)
+
+
 @pytest.mark.parametrize(("part", "kp", "kv"), [("kp", 0.7, 1.0), ("kv", 1.0, 0.7)])
 def test_one_gain_of_a_servo_is_scaled_and_nothing_else(part, kp, kv):
     plain, changed = world(SERVO).compile(), world(SERVO, ActuatorGain("drive", part), 0.7).compile()

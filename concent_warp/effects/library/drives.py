@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 import numpy as np
@@ -19,8 +19,10 @@ from concent_warp.effects.select import (
     each_of_several,
     element_name,
     gripper_actuators,
+    is_thruster,
     robot_bodies,
     servo_gain,
+    thrusters,
 )
 
 if TYPE_CHECKING:
@@ -51,21 +53,26 @@ GRIP_FACTORS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.
 """Factors on the grip force that are scanned [-]: the object slips only in a narrow range of them."""
 
 
+WITH_THRUSTERS = "actuators of joints, of tendons that add joints up, or of sites"
+
+
 class DriveEffect(Effect):
     """An effect on the actuators of an arm."""
 
     family = "joints"
     kind = "actuator"
     requirement = "actuators of joints, or of tendons that add joints up"
+    of_thrusters: ClassVar[bool] = False
+    """Whether actuators that push at a site, as rotors of a drone do, may lack it too."""
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether the actuator drives a joint."""
-        return bool(driven_joints(m, i))
+        """Return whether the actuator drives a joint, or pushes at a site where that may lack it too."""
+        return bool(driven_joints(m, i)) or (self.of_thrusters and is_thruster(m, i))
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return all actuators but the gripper's."""
-        found = arm_actuators(m)
+        """Return all actuators but the gripper's; where there are none, those that push at sites."""
+        found = arm_actuators(m) or (thrusters(m) if cls.of_thrusters else ())
         return (found,) if found else ()
 
 
@@ -101,7 +108,8 @@ class ActuatorGain(DriveEffect):
     source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
     signature = "residual torque in proportion to the commanded one; more or less sag under load"
     confusions = ("joint_compliance", "gravity_compensation", "load_friction", "mass")
-    requirement = f"{DriveEffect.requirement}; with kp or kv position servos that have both gains"
+    requirement = f"{WITH_THRUSTERS}; with kp or kv position servos that have both gains"
+    of_thrusters = True
     parts = GAINS
 
     def __init__(self, *target: str) -> None:
@@ -119,7 +127,7 @@ class ActuatorGain(DriveEffect):
         return super().has_as_special_case(other) or (self.part == KV and other.name == JointDamping.name)
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether the actuator drives a joint, and has two gains where one of them is off."""
+        """Return whether it may lack it, and has two gains where one of them is off."""
         return super().applies_to(m, i) and (not self.part or has_both_gains(m, i))
 
     @classmethod
@@ -168,6 +176,8 @@ class GripForce(ActuatorGain):
     source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
     signature = "the grasped object slips or does not; fingers close slower or faster"
     confusions = ("pad_friction", "mass")
+    requirement = f"{DriveEffect.requirement}; with kp or kv position servos that have both gains"
+    of_thrusters = False
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -241,6 +251,8 @@ class ActuatorDelay(DriveEffect):
     source = "transport delay; linear between time steps"
     signature = "residuals in proportion to the commanded speed; all later by the same time"
     confusions = ("latency", "actuator_lag", "joint_damping")
+    requirement = WITH_THRUSTERS
+    of_thrusters = True
     step_error = PHASE_ERROR
     history = 0.3
 
@@ -273,6 +285,8 @@ class ActuatorLag(DriveEffect):
     source = "first-order lag, exact for commands that are held over a step; the mean over each step acts"
     signature = "rounded corners after steps of the command"
     confusions = ("actuator_delay", "joint_damping", "latency")
+    requirement = WITH_THRUSTERS
+    of_thrusters = True
     step_error = PHASE_ERROR
     history = 0.5
 
