@@ -20,7 +20,7 @@ from concent_warp.estimation.joint_signals import HINGE_OR_SLIDE, CoupledJoints,
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.signals import MeasuredBall, MeasuredBody, MeasuredJoint, OrientationSignal, Signal
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
-from concent_warp.simulate.replay import commands, initial_state, interpolate, replay, step_count
+from concent_warp.simulate.replay import acting_commands, initial_state, interpolate, replay, step_count
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
@@ -332,9 +332,7 @@ def _simulated(model: Model, demonstration: Demonstration, engine: Engine, *, co
     qpos, qvel = initial_state(m, demonstration)
     time = np.array([0.0, max(demonstration.duration, engine.timestep)])
     base = time, np.stack([qpos, qpos]), np.stack([qvel, qvel])
-    ctrl = commands(m, demonstration, step_count(demonstration, engine.timestep) + 1)
-    for added in model.effects:
-        ctrl = added.effect.command(m, ctrl, added.array)
+    ctrl = acting_commands(model, m, demonstration, step_count(demonstration, engine.timestep) + 1)
     if not complete:
         rollout = replay(model, demonstration, engine, bodies=()).numpy()
         if np.isfinite(rollout.qpos).all() and np.isfinite(rollout.qvel).all():

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.effects.select import servo_gain
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
@@ -20,6 +21,18 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Channel, Demonstration
 
+RESTING = 0.03
+"""Time [s] over which a joint that is at rest when a recording begins does not move yet."""
+MIN_RESTING = 3
+"""Readings at least in that time."""
+FOLLOWING = 1.0
+"""Time [s] within which it has followed a step of its command."""
+JUMP_SHARE = 0.1
+"""Least step of the command over the range of the joint in the recording [-]: less may be sag or an offset."""
+MOVED_SHARE = 0.05
+"""Share of the step up to which a joint is at rest [-]."""
+FOLLOWED_SHARE = 0.5
+"""Share of the step that it follows at least [-]."""
 UNIT_QUATERNION_SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEQUAT, mujoco.mjtSensor.mjSENS_BALLQUAT)
 
 
@@ -44,7 +57,8 @@ def step_count(demonstration: Demonstration, timestep: float, duration: float | 
 def commands(model: mujoco.MjModel, demonstration: Demonstration, steps: int, start: float = 0.0) -> np.ndarray:
     """Return the recorded commands at each step, zero-order hold, shape (steps, nu).
 
-    Step k starts at `start` + k * dt and holds the last command given by then (the first one before that).
+    Step k starts at `start` + k * dt and holds the last command given by then; before that the first one, or the one
+    that held a robot at rest which the first one makes jump, see `resting_commands`.
 
     Raises:
         RecordingError: An actuator has no commands, or commands name an actuator that the model lacks.
@@ -67,7 +81,66 @@ def commands(model: mujoco.MjModel, demonstration: Demonstration, steps: int, st
         channel = demonstration.action[name]
         row = np.searchsorted(channel.time, time + 1e-9, side="right") - 1
         ctrl[:, i] = channel.value[np.maximum(row, 0)]
+    for i, held in resting_commands(model, demonstration).items() if start < 0 else ():
+        ctrl[time + 1e-9 < demonstration.action[names[i]].time[0], i] = held
     return ctrl
+
+
+def resting_commands(m: mujoco.MjModel, demonstration: Demonstration) -> dict[int, float]:
+    """Return the commands before the first ones, where these are the first of a jump, of actuators by their row.
+
+    A recording that begins with a step of the command does not say what was commanded before; a joint with a position
+    servo that is at rest then, and follows the step later, was held where it is. Delays and lags reach back there.
+    """
+    jumping: dict[int, tuple[np.ndarray, float]] = {}
+    for i in range(m.nu):
+        if servo_gain(m, i) <= 0 or m.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT):
+            continue
+        first = float(demonstration.action[m.actuator(i).name].value[0])
+        read = _readings(m, demonstration, int(m.actuator_trnid[i, 0]))
+        if read is not None and _follows_a_jump(read[0], value := float(m.actuator_gear[i, 0]) * read[1], first):
+            jumping[i] = value, first
+    if not jumping:
+        return {}
+    d, found = mujoco.MjData(m), {}
+    d.qpos[:] = initial_state(m, demonstration)[0]
+    mujoco.mj_forward(m, d)
+    for i, (value, first) in jumping.items():
+        dof = int(m.jnt_dofadr[m.actuator_trnid[i, 0]])
+        load = float(d.qfrc_bias[dof] - d.qfrc_passive[dof])
+        held = float(value[0]) + load / (servo_gain(m, i) * float(m.actuator_gear[i, 0]))
+        if _is_jump(first - held, value):
+            found[i] = held
+    return found
+
+
+def _readings(m: mujoco.MjModel, demonstration: Demonstration, joint: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return times and readings (n,) of a joint's position; None where it was not measured, or hardly."""
+    for name, channel in demonstration.measured.items():
+        row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        if row < 0 or m.sensor_type[row] != int(mujoco.mjtSensor.mjSENS_JOINTPOS) or m.sensor_objid[row] != joint:
+            continue
+        value = np.asarray(channel.value, dtype=float).reshape(len(channel.time), -1)[:, 0]
+        known = np.isfinite(value)
+        return (channel.time[known], value[known]) if known.sum() > MIN_RESTING else None
+    return None
+
+
+def _follows_a_jump(time: np.ndarray, value: np.ndarray, command: float) -> bool:
+    """Return whether readings (n,) rest at first, away from the command, and then follow it most of the way."""
+    jump = command - value[0]
+    if not _is_jump(jump, value):
+        return False
+    resting = (time <= time[0] + RESTING) | (np.arange(len(time)) < MIN_RESTING)
+    share = (value - value[0]) / jump
+    return bool(
+        np.abs(share[resting]).max() < MOVED_SHARE and share[time <= time[0] + FOLLOWING].max() > FOLLOWED_SHARE
+    )
+
+
+def _is_jump(jump: float, value: np.ndarray) -> bool:
+    """Return whether a step of the command is more than sag, or an offset, beside the range of all readings."""
+    return abs(jump) > JUMP_SHARE * np.ptp(value)
 
 
 def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[np.ndarray, np.ndarray]:
@@ -158,11 +231,18 @@ def replay(
     compiled = model.scene.model
     steps = step_count(demonstration, engine.timestep)
     qpos, qvel = initial_state(compiled, demonstration)
-    ctrl = commands(compiled, demonstration, steps)
-    for added in model.effects:
-        ctrl = added.effect.command(compiled, ctrl, added.array)
+    ctrl = acting_commands(model, compiled, demonstration, steps)
     variants = Variants(1, qpos=qpos[None], qvel=qvel[None])
     return engine.run(variants, ctrl, record=record, bodies=bodies, contacts=contacts)
+
+
+def acting_commands(model: Model, m: mujoco.MjModel, demonstration: Demonstration, steps: int) -> np.ndarray:
+    """Return the recorded commands at each step as the model's effects change them, shape (steps, nu)."""
+    before = int(np.ceil(max((a.effect.history for a in model.effects), default=0.0) / m.opt.timestep))
+    ctrl = commands(m, demonstration, before + steps, -before * m.opt.timestep)
+    for added in model.effects:
+        ctrl = added.effect.command(m, ctrl, added.array)
+    return ctrl[before:]
 
 
 def bracketing(time: np.ndarray, timestep: float, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
