@@ -157,7 +157,7 @@ class Speeds:
     angular: np.ndarray
     """[rad/s], world frame, shape (K, nbody, 3)."""
     reach: np.ndarray
-    """Distance of the farthest point of each body from its frame's origin [m], shape (nbody,)."""
+    """Distance of the farthest point of each body from its frame's origin [m], shape (nbody,), see `_reaches`."""
 
     @staticmethod
     def of(motion: BodyPoses, compiled: mujoco.MjModel) -> Speeds:
@@ -201,11 +201,16 @@ class Speeds:
 
 
 def _reaches(compiled: mujoco.MjModel) -> np.ndarray:
-    """Return how far the geoms of each body reach from its frame's origin [m], shape (nbody,)."""
+    """Return how far the geoms of each body reach from its frame's origin [m], shape (nbody,).
+
+    A body without geoms reaches as far as its radius of gyration beyond its centre of mass.
+    """
     reach = np.zeros(compiled.nbody)
     far = np.linalg.norm(compiled.geom_pos, axis=1) + compiled.geom_rbound
     np.maximum.at(reach, compiled.geom_bodyid, np.where(compiled.geom_rbound > 0, far, 0.0))
-    return reach
+    gyration = np.sqrt(compiled.body_inertia.max(axis=1) / np.maximum(compiled.body_mass, 1e-12))
+    bare = (compiled.body_geomnum == 0) & (compiled.body_mass > 0)
+    return np.where(bare, np.linalg.norm(compiled.body_ipos, axis=1) + gyration, reach)
 
 
 def _body_state(

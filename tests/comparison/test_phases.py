@@ -83,6 +83,13 @@ def test_a_pendulum_swings_free_without_resting_where_it_turns():
     assert names(phases(PENDULUM.format(damping=0), 3, qpos=[1.0])) == ["free"]
 
 
+def test_a_wheel_without_shapes_that_spins_about_its_axis_does_not_rest():
+    wheel = """<mujoco><worldbody><body><joint name="axle" axis="0 0 1"/>
+      <inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .01"/></body></worldbody></mujoco>"""
+    assert names(phases(wheel, 0.5, qvel=[3.0])) == ["free"]
+    assert names(phases(wheel, 0.5)) == ["rest"]
+
+
 def test_a_damped_pendulum_comes_to_rest():
     assert names(phases(PENDULUM.format(damping=0.12), 6, qpos=[0.5])) == ["free", "rest"]
 
