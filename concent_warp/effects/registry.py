@@ -110,6 +110,6 @@ def effect_class(name: str) -> type[Effect]:
     known = effect_classes() | {kind.name: kind for kind in NOMINAL}
     if name in known:
         return known[name]
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known)}"
+    near = [n for n in effect_classes() if name and name in n] or difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"one of {', '.join(known)}"
     raise ModelError(f"no effect {name!r}", fix=hint)

@@ -208,6 +208,8 @@ def test_an_effect_is_found_by_its_name_and_others_are_suggested():
     assert list(effect_classes())[: len(OURS)] == [effect.name for effect in OURS]
     with pytest.raises(ModelError, match=r"no effect 'joint_frictoin'.*did you mean 'joint_friction'"):
         effect_class("joint_frictoin")
+    with pytest.raises(ModelError, match=r"did you mean .*'joint_friction' or .*'sliding_friction'"):
+        effect_class("friction")
     with pytest.raises(ModelError, match=r"no effect 'zzz'.*one of joint_friction, joint_damping"):
         effect_class("zzz")
 
