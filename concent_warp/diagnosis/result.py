@@ -391,7 +391,9 @@ class Diagnosis:
         if self.verdict == "none_needed":
             said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise.")
             if self.detectable:
-                shown = "; ".join(with_unit(f"{d.name} {d.parameter} {d.size:.2g}", d.unit) for d in self.detectable[:6])
+                shown = "; ".join(
+                    with_unit(f"{d.name} {d.parameter} {d.size:.2g}", d.unit) for d in self.detectable[:6]
+                )
                 said.append(f"Smallest detectable sizes: {shown}.")
         for k, finding in enumerate(self.accepted):
             group = self.groups[k] if k < len(self.groups) else (finding.name,)
