@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.scene.sensor_frame import sensor_frame
+from concent_warp.scene.touchable import touchable_pairs
 
 JOINT = mujoco.mjtJoint
 SENSOR = mujoco.mjtSensor
@@ -179,22 +180,6 @@ def surfaces(m: mujoco.MjModel, body: int) -> np.ndarray:
     """Return the colliding geoms of a body and all static colliding geoms, shape (n,) int."""
     ids = np.union1d(geoms_of(m, body), static_geoms(m))
     return ids[(m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)]
-
-
-def touchable_pairs(m: mujoco.MjModel) -> np.ndarray:
-    """Return which geoms MuJoCo lets touch, by their masks and bodies, shape (ngeom, ngeom) bool, symmetric."""
-    kind, affinity = m.geom_contype, m.geom_conaffinity
-    masks = (kind[:, None] & affinity[None]) | (affinity[:, None] & kind[None])
-    weld = m.body_weldid[m.geom_bodyid]
-    found = (masks != 0) & (weld[:, None] != weld[None])
-    if not m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
-        above = m.body_weldid[m.body_parentid[weld]]
-        carried = (above[:, None] == weld[None]) & (above[:, None] != 0)
-        found &= ~(carried | carried.T)
-    for signature in m.exclude_signature:
-        one, other = m.geom_bodyid == int(signature) >> 16, m.geom_bodyid == int(signature) & 0xFFFF
-        found &= ~(one[:, None] & other[None] | other[:, None] & one[None])
-    return found
 
 
 def jointed_contact_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:

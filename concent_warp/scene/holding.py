@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.touchable import touchable_pairs
 
 Holding = Literal["joints", "cones", "contacts"]
 """Where dry friction acts; `cones` are those of contacts, which are pyramids by default."""
@@ -55,9 +56,10 @@ def contact_constants(scene: Scene, where: Holding) -> dict[str, str]:
     """Return MJCF options of elliptic cones, and for "contacts" of cones that hold; none where that changes nothing."""
     options, m = ElementTree.fromstring(scene.xml).findall("option"), scene.model
     given = {name for option in options for name in option.attrib}
-    touches = bool(m.npair) or bool(((m.geom_contype | m.geom_conaffinity) != 0).any())
     pyramids = m.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC
-    if not touches or (pyramids and "cone" in given) or not (pyramids or where == "contacts"):
+    if pyramids and ("cone" in given or not (m.npair or touchable_pairs(m).any())):
+        return {}
+    if not (pyramids or where == "contacts"):
         return {}
     if where == "contacts" and ("impratio" in given or m.opt.impratio != 1.0):
         return {}

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.effects import select
 from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction, TorsionalFriction
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.touchable import touchable_pairs
 
 DOOR = """
 <mujoco><worldbody>{world}
@@ -30,7 +30,7 @@ def compiled(**parts: str) -> mujoco.MjModel:
 
 def test_geoms_touch_unless_a_mask_a_joint_between_them_or_an_exclusion_forbids_it():
     def touching(m: mujoco.MjModel) -> set[str]:
-        pairs = np.argwhere(np.triu(select.touchable_pairs(m)))
+        pairs = np.argwhere(np.triu(touchable_pairs(m)))
         return {f"{m.geom(int(a)).name} {m.geom(int(b)).name}" for a, b in pairs}
 
     assert touching(compiled()) == {"tip panel", "tip handle"}  # the door carries its handle

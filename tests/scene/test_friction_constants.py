@@ -10,7 +10,8 @@ from concent_warp.scene.scene import Scene
 
 MASS = 1.2345678901
 SCENE = (
-    "<mujoco><option timestep='.002'{option}/>{default}<worldbody><body><joint name='a' type='slide'{joint}/>"
+    "<mujoco><option timestep='.002'{option}/>{default}<worldbody><geom type='plane' size='1 1 .1'/>"
+    "<body><joint name='a' type='slide'{joint}/>"
     f"<inertial pos='0 0 0' mass='{MASS}' diaginertia='.1 .1 .1'/>"
     "<body><joint name='b' frictionloss='.2' axis='0 1 0'/><geom size='.1'/></body></body></worldbody></mujoco>"
 )
