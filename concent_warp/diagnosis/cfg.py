@@ -79,6 +79,9 @@ class SearchCfg:
     max_scanned_rise: Annotated[float, Bounds(1)] = 1.5
     """Squared residual that a scanned value leaves there, over the least of those before, above which none beyond it is
     tried [-]. Empirical."""
+    limit_halvings: Count = 4
+    """Times that the distance between the best scanned value of a limit and its neighbours is halved [-]: scanned ones
+    are a fifth apart, limits then 1 %, the tolerance of a nominal value."""
     remainder_promise: Share = 0.75
     """Share of the gain that `DiagnoseCfg.max_remainder` asks for which a screened candidate must promise to be fitted
     [-]: little is left there, and residuals are nearly in proportion to an effect's size."""

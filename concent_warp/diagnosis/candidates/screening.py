@@ -154,7 +154,7 @@ def _scan(
 
     Threshold effects such as adhesion or backlash have no sensitivity at their null value. Values that gain nothing in
     the windows with the largest residuals are simulated in no others, and those beyond one that is far worse there than
-    an earlier one in no window.
+    an earlier one in no window. Limits are tried between scanned values, too, see `_between`.
 
     Args:
         solver: Solver of the candidate.
@@ -174,21 +174,56 @@ def _scan(
     def left_first(moved: np.ndarray) -> float:
         return robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
 
+    def gain_of(moved: np.ndarray, left: float) -> float:
+        if left >= first_before:
+            return 0.0
+        if rest:
+            left += robust_sum(base, projected_residuals(solver, base, moved, offsets, rest))
+        return 1 - left / total
+
     for outward in _outward(solver, values):
-        least = np.inf
         limits = unlimited.any() and all(np.isfinite(moved[unlimited]).all() for moved in outward)
-        for moved in outward[_idle(outward, left_first) if limits else 0 :]:
+        line, tried = outward[_idle(outward, left_first) if limits else 0 :], []
+        for moved in line:
             left = left_first(moved)
-            least = min(least, left)
-            if left > max(cfg.max_scanned_rise * least, first_before):
+            tried.append(left)
+            if left > max(cfg.max_scanned_rise * min(tried), first_before):
                 break
-            if left >= first_before:
-                continue
-            if rest:
-                left += robust_sum(base, projected_residuals(solver, base, moved, offsets, rest))
-            if 1 - left / total > best:
-                best, start = 1 - left / total, moved
+            if (gain := gain_of(moved, left)) > best:
+                best, start = gain, moved
+        if limits and len(tried) > 1:
+            moved, left = _between(line, int(np.argmin(tried)), min(tried), left_first, cfg.limit_halvings)
+            if (gain := gain_of(moved, left)) > best:
+                best, start = gain, moved
     return best, start
+
+
+def _between(
+    line: Sequence[np.ndarray], k: int, least: float, left: Callable[[np.ndarray], float], halvings: int
+) -> tuple[np.ndarray, float]:
+    """Return the parameters (P,) near the best of a line that leave least, and what they leave.
+
+    What a limit takes away grows slowly from where it is first reached, and just below the true one far too much is cut
+    off: the best value may lie in a narrow range between two scanned ones.
+
+    Args:
+        line: Scanned parameters, (P,) each.
+        k: Which of them leaves least.
+        least: What that leaves.
+        left: Returns the robust sum of squares that parameters leave.
+        halvings: How often the distance to the neighbours is halved.
+    """
+    before, best, after = line[max(k - 1, 0)], line[k], line[min(k + 1, len(line) - 1)]
+    for _ in range(halvings):
+        ends = [(before + best) / 2, (best + after) / 2]
+        found = [left(end) if (end != best).any() else np.inf for end in ends]
+        if min(found) >= least:
+            before, after = ends
+        elif found[0] < found[1]:
+            before, best, after, least = before, ends[0], best, found[0]
+        else:
+            before, best, after, least = best, ends[1], after, found[1]
+    return best, least
 
 
 def _idle(outward: Sequence[np.ndarray], left: Callable[[np.ndarray], float]) -> int:

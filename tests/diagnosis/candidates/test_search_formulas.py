@@ -182,6 +182,22 @@ def test_scanned_values_beyond_one_that_is_far_worse_are_not_tried(monkeypatch):
     assert [values[1] for values, _ in tried] == [2.0, 1.0, 0.0, 4.0, 5.0, 9.0]
 
 
+def test_limits_are_tried_between_scanned_values_too(monkeypatch):
+    def share(values):  # it shows between 2.3 and 3.1 only
+        return 1 - 0.6 * max(1 - abs(values[1] - 2.7) / 0.4, 0) + 5 * max(2.6 - values[1], 0)
+
+    limit = Parameter("limit", "-", np.inf, 0.0, 8.0, 1.0, scan=(1.0, 2.0, 3.0, 4.0, 5.0))
+    gain, start, _, _ = scanning(monkeypatch, [OWN, limit], share)
+    assert 1 - share([0.5, 3.0]) < 0.2
+    assert start[1] == pytest.approx(2.7, abs=0.1)
+    assert gain > 0.45
+    assert gain == pytest.approx(1 - share(start))
+    # Other parameters are not.
+    limit = replace(limit, null=6.0)
+    gain, start, _, _ = scanning(monkeypatch, [OWN, limit], share)
+    assert start[1] == 3.0
+
+
 def fitted(errors: np.ndarray, **changes: Any) -> Any:
     """Return a fitted candidate with held-out errors."""
     rarity = changes.pop("rarity", 0.0)

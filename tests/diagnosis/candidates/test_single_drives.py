@@ -81,3 +81,18 @@ def test_an_effect_on_all_drives_is_not_named_where_that_on_one_explains_as_much
     x = Channel(time, rng.normal(0, 1e-4, (len(time), 1)), 1e-4)
     quiet = Demonstration("demo_0", action=still, measured={**demonstration.measured, "x": x})
     assert named(Recording(GANTRY, (quiet,))).groups == (("actuator_saturation(across)",),)
+
+
+def test_a_limit_that_shows_between_two_scanned_values_only_is_found():
+    # Just below the limit too much is cut off; above it the effect fades soon.
+    def left(values):
+        return 10 * (1 + 500 * max(LIMIT - values[0], 0) - 0.4 * max(1 - abs(values[0] / LIMIT - 1) / 0.2, 0))
+
+    line = [np.array([v]) for v in LIMIT * 1.08 * np.geomspace(1.4, 0.7, 5)]
+    scanned = [left(v) for v in line]
+    k = int(np.argmin(scanned))
+    best, least = screening._between(line, k, scanned[k], left, cw.DiagnoseCfg().search.limit_halvings)
+    assert best[0] == pytest.approx(LIMIT, rel=0.01)
+    assert least == left(best) < 0.85 * scanned[k]
+    assert line[k][0] / LIMIT > 1.05
+    assert screening._between(line[:1], 0, scanned[0], left, 4) == (line[0], scanned[0])
