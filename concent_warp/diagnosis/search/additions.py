@@ -99,6 +99,10 @@ class Additions:
                     fitted, record.time_step = bounded, before
                 break
             detectable = detectable or smallest
+            if best is not None and not effects_alone and (held := self._held_instead(fitted[-1])) is not None:
+                record.forget(*recorded)
+                fitted, record.time_step, record.held_first = [*fitted[:-1], held], before, len(record.holding)
+                continue
             equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
             if bounded is not None and (
                 best is None or not leaves_more(errors_like(bounded[-1], fitted[-1]), best.errors, cfg.search)
@@ -177,10 +181,13 @@ class Additions:
         return one.ratio * float(np.sqrt(left)) <= self.context.cfg.search.explained_ratio
 
     def with_holding(self, one: FittedModel) -> FittedModel:
+        """Return a fitted model with dry friction that holds where more than noise is left and that explains more."""
+        context = self.context
+        return self._held(one) if is_lacking(one, context.noise_factors, context.cfg) else one
+
+    def _held(self, one: FittedModel) -> FittedModel:
         """Return a fitted model with dry friction that holds where that explains more, else that model."""
         context = self.context
-        if not is_lacking(one, context.noise_factors, context.cfg):
-            return one
         context.progress("holding by friction")
         unsettled = "Open: whether friction that holds explains more."
         found = context.budget.attempt(lambda: hold(one, context.record.holding, context.cfg), None, unsettled)
@@ -188,6 +195,18 @@ class Additions:
             return one
         held, context.record.holding = found
         return held
+
+    def _held_instead(self, one: FittedModel) -> FittedModel | None:
+        """Return the model as given with dry friction that holds where it leaves no more than noise, else None.
+
+        It is None, too, where that explains no more. Such a model stays as given until an effect is found beside it; beside effects, and where
+        more is left, friction has been tried before.
+        """
+        context = self.context
+        if is_lacking(one, context.noise_factors, context.cfg):
+            return None
+        held = self._held(one)
+        return None if held is one else held
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""

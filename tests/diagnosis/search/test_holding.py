@@ -20,7 +20,7 @@ from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
-from tests.diagnosis.made_up import node, procedure
+from tests.diagnosis.made_up import finding, node, procedure
 
 STEP, MASS, FRICTION, DAMPING, KP, KV, NOISE = 1e-4, 1.6, 2.5, 4.0, 2500.0, 60.0, 2e-5
 STAGE = (
@@ -172,3 +172,28 @@ def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any)
     monkeypatch.setattr(alone.additions.finder, "find", lambda *_, **__: (nodes[1], ()))
     assert alone.additions.add_effects(nodes[:1], (), effects_alone=True)[0] == nodes[:2]
     assert len(asked) == 1
+
+
+@pytest.mark.parametrize("explains", [True, False])
+def test_friction_that_holds_is_tried_before_an_effect_is_named_beside_little(monkeypatch: Any, explains):
+    made, found = procedure(max_additions=1), []
+    given, held, better = node(1.0), node(0.9), node(0.95, effects=1)
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(made.context, "nominal", lambda *_: None)
+
+    def find(base, step, **_):
+        found.append(base)
+        made.record.findings.append(finding("backlash", 0.1, step=step))
+        made.record.groups.append(("backlash",))
+        return (better if base is given else None), ()
+
+    monkeypatch.setattr(made.additions.finder, "find", find)
+    monkeypatch.setattr(additions, "hold", lambda one, _known, _cfg: (held, ("joints",)) if explains else (one, ()))
+    after, _ = made.additions.add_effects([given], ())
+    if explains:
+        assert (after, found) == ([held], [given, held])
+        assert (made.record.holding, made.record.held_first) == (("joints",), 1)
+        assert len(made.record.findings) == 1  # what was found beside friction that creeps is forgotten
+    else:
+        assert (after, found) == ([given, better], [given])
