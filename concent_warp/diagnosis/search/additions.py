@@ -199,8 +199,8 @@ class Additions:
     def _held_instead(self, one: FittedModel) -> FittedModel | None:
         """Return the model as given with dry friction that holds where it leaves no more than noise, else None.
 
-        It is None, too, where that explains no more. Such a model stays as given until an effect is found beside it; beside effects, and where
-        more is left, friction has been tried before.
+        It is None, too, where that explains no more. Such a model stays as given until an effect is found beside it;
+        beside effects, and where more is left, friction has been tried before.
         """
         context = self.context
         if is_lacking(one, context.noise_factors, context.cfg):
