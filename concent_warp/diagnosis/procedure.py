@@ -27,6 +27,7 @@ from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
 from concent_warp.diagnosis.search.adequacy import discrepancies, hidden_by_noise, is_lacking, least_ratio
 from concent_warp.diagnosis.search.alternatives import try_alternatives
+from concent_warp.diagnosis.search.consistency import beyond_effects
 from concent_warp.diagnosis.search.context import (
     ADDITIONS_DONE,
     BASELINE_DONE,
@@ -39,7 +40,6 @@ from concent_warp.diagnosis.search.impact_errors import stand
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
 from concent_warp.diagnosis.search.time_step import may_be_step
-from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -401,17 +401,12 @@ class Procedure:
             context.runner.enter(VALUES_DONE, 1.0)
             context.progress("testing forces of no known form")
             unknown = budget.attempt(
-                lambda: unknown_force(nodes, cfg, context.results),
+                lambda: beyond_effects(
+                    nodes, record.hypotheses, cfg, context.results, form_corrected=record.form_corrected
+                ),
                 None,
                 "Open: whether a force of unknown form explains more.",
             )
-        if (
-            unknown is not None
-            and record.form_corrected
-            and not unknown.form_error
-            and unknown.share < cfg.max_form_error
-        ):
-            unknown = replace(unknown, form_error=True)
         verdict: Verdict = "none_needed"
         lacking = unknown is not None and not unknown.form_error
         if lacking and not added:
@@ -430,7 +425,10 @@ class Procedure:
         where = budget.attempt(lambda: () if explained else self._failures(given), (), unsettled)
         experiment = budget.attempt(lambda: None if explained else self._suggested_experiment(), None, unsettled)
         after = fitted[1:] if fitted[0] is given else fitted
-        alike = budget.attempt(lambda: self._replayed(given, last) if named and cfg.explain else None, None, unsettled)
+        replay = (cfg.explain or not named) and fitted[-1] is not given
+        alike = budget.attempt(lambda: self._replayed(given, last) if replay else None, None, unsettled)
+        # What is not named is saved only where it follows the recording better.
+        farther = not named and alike is not None and alike.better > alike.given
         return Diagnosis(
             verdict=verdict,
             effects=tuple(sorted(record.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
@@ -446,12 +444,13 @@ class Procedure:
             unknown_force=unknown,
             form_error=form_error if named else None,
             remainder_searched=not budget.cut if named else None,
-            replayed=alike,
+            replayed=alike if named else None,
             time_step=step,
             holding=record.holding,
             nominal_values=record.nominal_values,
             unsettled=tuple(budget.unsettled),
-            explains=verdict != "none_of_these" or unexplained <= 1 - cfg.min_explained,
+            explains=not farther and (verdict != "none_of_these" or unexplained <= 1 - cfg.min_explained),
+            farther=farther,
         )
 
     def _replayed(self, given: FittedModel, last: FittedModel) -> Replayed | None:

@@ -19,6 +19,8 @@ from concent_warp.model import Model
 from concent_warp.scene.holding import Holding
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these", "unsettled"]
+FARTHER = "In a replay in one piece the model with what was fitted is farther off than as given: it stays as given."
+"""What is said where nothing was named, and what was fitted makes a replay worse."""
 VERDICTS: dict[Verdict, str] = {
     "effect": "an effect is missing, and the data identify it",
     "group": "an effect is missing; the data cannot distinguish between a few",
@@ -287,6 +289,8 @@ class Diagnosis:
     """Sentences on what there was no time for, see `DiagnoseCfg.seconds`."""
     explains: bool = True
     """Whether the accepted effects explain enough to be in `model`, see `DiagnoseCfg.min_explained`."""
+    farther: bool = False
+    """Whether `model` stays as given as what was found, and not named, makes a replay of the recording worse."""
 
     @property
     def model(self) -> Model:
@@ -416,7 +420,8 @@ class Diagnosis:
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
             )
             if not self.explains and self.accepted:
-                said.append("The effects above explain too little to be added: the model stays as given.")
+                too_little = "The effects above explain too little to be added: the model stays as given."
+                said.append(FARTHER if self.farther else too_little)
         said += self._remainder_sentences()
         if self.unknown_force is not None:
             said.append(self.unknown_force.sentence)
@@ -432,6 +437,8 @@ class Diagnosis:
                 for p in self.nominal_values
             )
             numerical.append(f"Nominal values were fitted within their tolerances: {values}.")
+        if self.farther and not self.accepted:
+            numerical.append(FARTHER)
         return [*self.issues, *numerical, *said, *self.unsettled]
 
 

@@ -130,6 +130,8 @@ class Effect:
     are uncertain, where it is no constant of the bodies. Part of the intervals."""
     step_error: ClassVar[float] = 0.0
     """Standard deviation of its values due to the model's time step, over the step [-]. Part of the intervals."""
+    exact: ClassVar[bool] = False
+    """Whether its formula leaves nothing out, so that its values are the same in all windows of a recording."""
     part_of: ClassVar[str] = ""
     """Name of the effect that is the same quantity without a tolerance, for a nominal value; see `is_within`."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")

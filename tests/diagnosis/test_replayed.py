@@ -12,6 +12,7 @@ from concent_warp.diagnosis.replayed import Replayed, replayed
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
+from tests.diagnosis.made_up import finding, node, procedure
 from tests.diagnosis.test_diagnosis import diagnosis
 from tests.diagnosis.test_failures import XML, recorded
 
@@ -67,3 +68,28 @@ def test_a_recording_that_cannot_be_replayed_says_nothing(recording):
     unread = replace(channel, value=np.full_like(channel.value, np.nan))
     empty = replace(recording, demonstrations=(replace(recording[0], measured={"rail_position": unread}),))
     assert replayed(model, model, empty, observe(model, recording), 10.0, "mujoco") is None
+
+
+@pytest.mark.parametrize(
+    ("ratio", "accepted", "verdict", "stays"),
+    [(1.0, False, "none_needed", True), (1.6, True, "none_of_these", True), (1.0, True, "effect", False)],
+)
+def test_what_is_not_named_is_saved_only_where_it_follows_the_recording_better(
+    monkeypatch, ratio, accepted, verdict, stays
+):
+    for better, worse in ((2.1, True), (1.9, False)):
+        made, given, last = procedure(), node(3.0), node(ratio, effects=1)
+        monkeypatch.setattr(made, "_replayed", lambda *_, better=better: Replayed(2.0, better, 0.5, False))
+        monkeypatch.setattr("concent_warp.diagnosis.procedure.beyond_effects", lambda *_, **__: None)
+        made.record.findings = [finding("mass", 0.5)] if accepted else []
+        found = made.conclude(given, [given, last] if accepted else [last], (), ())
+        assert found.verdict == verdict
+        assert found.explains == (not (stays and worse))
+        assert found.model is (found.models[0] if stays and worse else found.models[-1])
+        assert any("stays as given" in sentence for sentence in found.sentences()) == (stays and worse)
+        assert found.replayed is None
+    # Where nothing was changed there is nothing to replay.
+    made = procedure()
+    monkeypatch.setattr(made, "_replayed", lambda *_: pytest.fail("replayed"))
+    given = node(1.0)
+    assert made.conclude(given, [given], (), ()).explains

@@ -29,6 +29,7 @@ class GravityTilt(Effect):
     family = "world"
     kind = "none"
     summary = "Gravity is turned about the world's x and y axes."
+    exact = True
     source = "geometry"
     signature = "a constant residual force along one horizontal direction"
     confusions = ("center_of_mass", "frame_offset", "wind", "anisotropic_friction")

@@ -137,7 +137,7 @@ def test_effects_are_removed_one_at_a_time_and_the_rest_fitted_together(monkeypa
     # What the removed ones explain needs no force of unknown form.
     assert made.record.with_unestablished == ["given", "joint all"]
     tested = []
-    monkeypatch.setattr(module, "unknown_force", lambda nodes, *_: tested.append(nodes))
+    monkeypatch.setattr(module, "beyond_effects", lambda nodes, *_, **__: tested.append(nodes))
     made.record.findings, made.record.with_unestablished = [finding("a", 0.1)], [node(3), node(1.2), node(1.0)]
     given, last = node(3), node(1.1)
     assert made.conclude(given, [given, last], (), ()).verdict == "effect"
