@@ -335,7 +335,8 @@ class DiagnoseCfg:
     Empirical."""
     min_explained: Share = 0.2
     """Share of the discrepancy that the accepted effects must explain if something else is missing, or the model stays
-    as given [-]: what explains less is rather an imitation. That of `SearchCfg.far_min_gain`."""
+    as given [-], over windows and in a replay in one piece: what explains less is rather an imitation. That of
+    `SearchCfg.far_min_gain`."""
     max_fits: Count = 8
     """Most screened candidates that are fitted. Empirical: the truth is among the first eight in nearly all scenes."""
     max_additions: Annotated[int, Bounds(1, 1000)] = 3

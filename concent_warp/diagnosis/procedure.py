@@ -428,7 +428,8 @@ class Procedure:
         replay = (cfg.explain or not named) and fitted[-1] is not given
         alike = budget.attempt(lambda: self._replayed(given, last) if replay else None, None, unsettled)
         # What is not named is saved only where it follows the recording better.
-        farther = not named and alike is not None and alike.better > alike.given
+        least = cfg.min_explained if verdict == "none_of_these" else 0.0
+        farther = not named and alike is not None and not alike.explains(least)
         return Diagnosis(
             verdict=verdict,
             effects=tuple(sorted(record.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),

@@ -34,6 +34,10 @@ class Replayed:
     doubtful: bool
     """Whether `better` is so large that the answer says it, see `DiagnoseCfg.doubtful_replay`."""
 
+    def explains(self, share: float) -> bool:
+        """Return whether the better model explains a share of the squared residual of the given one above the noise."""
+        return self.better**2 - 1 <= (1 - share) * max(self.given**2 - 1, 0.0)
+
     @property
     def sentence(self) -> str:
         """What a doubtful replay says of the answer."""

@@ -19,8 +19,11 @@ from concent_warp.model import Model
 from concent_warp.scene.holding import Holding
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these", "unsettled"]
-FARTHER = "In a replay in one piece the model with what was fitted is farther off than as given: it stays as given."
-"""What is said where nothing was named, and what was fitted makes a replay worse."""
+FARTHER = (
+    "In a replay in one piece the model with what was fitted is farther off than as given, or hardly nearer: it stays as "
+    "given."
+)
+"""What is said where nothing was named, and what was fitted makes a replay no better."""
 VERDICTS: dict[Verdict, str] = {
     "effect": "an effect is missing, and the data identify it",
     "group": "an effect is missing; the data cannot distinguish between a few",
@@ -290,7 +293,7 @@ class Diagnosis:
     explains: bool = True
     """Whether the accepted effects explain enough to be in `model`, see `DiagnoseCfg.min_explained`."""
     farther: bool = False
-    """Whether `model` stays as given as what was found, and not named, makes a replay of the recording worse."""
+    """Whether `model` stays as given as what was found, and not named, makes a replay of the recording no better."""
 
     @property
     def model(self) -> Model:

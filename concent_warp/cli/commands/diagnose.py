@@ -192,7 +192,7 @@ def _save_accepted(arguments: Arguments, found: Diagnosis) -> None:
     if not found.changes_model:
         if not arguments.json:
             why = "The accepted effects explain too little" if found.accepted else "No effect was accepted"
-            why = "What was fitted makes a replay worse" if found.farther else why
+            why = "What was fitted makes a replay no better" if found.farther else why
             say(escape(f"{why}: {path} was not written."))
         return
     make_folder(path.parent)
