@@ -20,8 +20,8 @@ from concent_warp.scene.holding import Holding
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these", "unsettled"]
 FARTHER = (
-    "In a replay in one piece the model with what was fitted is farther off than as given, or hardly nearer: it stays as "
-    "given."
+    "In a replay in one piece the model with what was fitted is farther off than as given, or hardly nearer: it stays "
+    "as given."
 )
 """What is said where nothing was named, and what was fitted makes a replay no better."""
 VERDICTS: dict[Verdict, str] = {
