@@ -164,6 +164,35 @@ def indistinguishable(
     ]
 
 
+def equal_at_noise(
+    base: FittedModel,
+    group: Sequence[tuple[FittedCandidate, Finding]],
+    accepted: Sequence[tuple[FittedCandidate, Finding]],
+    cfg: SearchCfg,
+) -> list[tuple[FittedCandidate, Finding]]:
+    """Return a group with those that leave no more than noise, as its first does, and are nearly as plausible.
+
+    Beside nominal values how much either leaves of so little is weak evidence: those that are fitted are what shows
+    beside one of them. Odds decide, as between the answers of two searches.
+
+    Args:
+        base: The fitted baseline.
+        group: What `indistinguishable` returned.
+        accepted: All that it may have.
+        cfg: Settings.
+    """
+    first, found = group[0], list(group)
+    if first[0].ratio > cfg.explained_ratio:
+        return found
+    least = _plausibility(base, *first) - 2 * np.log(cfg.max_odds)
+    for c, f in accepted:
+        known = any(c is other for other, _ in found)
+        special = any(c.effect.has_as_special_case(o.effect) or _is_on_part(o, c) for o, _ in found)
+        if not (known or special) and c.ratio <= cfg.explained_ratio and _plausibility(base, c, f) > least:
+            found.append((c, f))
+    return found
+
+
 def _is_on_part(one: FittedCandidate, other: FittedCandidate) -> bool:
     """Return whether a candidate is the effect of another one on some of its elements."""
     return one.effect.name == other.effect.name and set(one.effect.elements) < set(other.effect.elements)

@@ -14,7 +14,7 @@ import numpy as np
 from concent_warp.diagnosis.candidates.baseline import add_candidate, fitted_model, refit_without_effect
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.candidates.candidates import has_effect
-from concent_warp.diagnosis.candidates.evidence import assess, indistinguishable
+from concent_warp.diagnosis.candidates.evidence import assess, equal_at_noise, indistinguishable
 from concent_warp.diagnosis.candidates.fit_candidate import fitted_candidate
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Finding
@@ -105,10 +105,12 @@ def reconsider(last: FittedModel, effect: int, among: Sequence[Rival], cfg: Diag
             pairs.append((c, replace(f, name=old.name, p=old.p, smallest_p=old.smallest_p, accepted=True, reason="")))
     if not pairs:
         return None
-    group = tuple(indistinguishable(base, pairs, cfg.search))
+    group = indistinguishable(base, pairs, cfg.search)
+    if any(added.effect.nominal for added in base.model.effects):
+        group = equal_at_noise(base, group, pairs, cfg.search)
     found = _in_place(last, effect, group[0][0])
     as_good = found.errors.sum() <= (1 + cfg.search.equal_error) * last.errors.sum()
-    return Reconsidered(found, group) if as_good else None
+    return Reconsidered(found, tuple(group)) if as_good else None
 
 
 def _in_place(last: FittedModel, effect: int, c: FittedCandidate) -> FittedModel:

@@ -10,6 +10,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedM
 from concent_warp.diagnosis.candidates.evidence import (
     assess,
     detectable_size,
+    equal_at_noise,
     fitted_parameters,
     indistinguishable,
     removed_by_channel,
@@ -232,3 +233,29 @@ def test_one_that_a_rare_best_lets_in_must_not_leave_more_than_the_likeliest(bas
         ]
         found[factor] = set(order(base, pairs, SearchCfg(max_odds=1e9, equal_standard_errors=0.1, equal_error=0.001)))
     assert found == {1.0: {"rare", "likeliest"}, more: {"rare", "likeliest", "other"}}
+
+
+def test_at_the_noise_odds_decide_which_others_belong_to_a_group(base, damping, monkeypatch):
+    friction = fit_candidate(base, screen(base, effect_class("joint_friction")("hinge")))
+    monkeypatch.setattr(effect_class("joint_damping"), "rarity", 0.0)
+    monkeypatch.setattr(effect_class("joint_friction"), "rarity", 0.0)
+    cfg, count = SearchCfg(), base.blocks.count
+    null = [Prediction(base.model, (c.effect,), base.windows).parameters[-1].null for c in (damping, friction)]
+    # Errors that are larger by this factor in all blocks have odds of 20 against them.
+    factor = cfg.max_odds ** (2 / count)
+    for ratios, larger, known in (
+        ((1.0, 1.05), 0.99 * factor, True),
+        ((1.0, 1.05), 1.01 * factor, False),
+        ((1.0, 1.11), 0.99 * factor, False),
+        ((1.11, 1.05), 0.99 * factor, False),
+    ):
+        first = pair(base, replace(damping, ratio=ratios[0]), "damping", null[0])
+        other = pair(base, replace(friction, ratio=ratios[1], errors=larger * damping.errors), "friction", null[1])
+        assert [f.name for _, f in indistinguishable(base, [first, other], cfg)] == ["damping"]
+        found = equal_at_noise(base, [first], [other, first], cfg)
+        assert [f.name for _, f in found] == ["damping", *(["friction"] if known else [])]
+        assert equal_at_noise(base, found, [other, first], cfg) == found
+    monkeypatch.setattr(effect_class("joint_friction"), "has_as_special_case", lambda *_: True)
+    first = pair(base, replace(damping, ratio=1.0), "damping", null[0])
+    other = pair(base, replace(friction, ratio=1.0, errors=damping.errors), "friction", null[1])
+    assert equal_at_noise(base, [first], [other], cfg) == [first]
