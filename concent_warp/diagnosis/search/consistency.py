@@ -46,8 +46,7 @@ def beyond_effects(
     """
     found = unknown_force(nodes, cfg, results)
     if found is None or found.form_error:
-        other = inconsistent_effect(nodes[0], nodes[-1], hypotheses, cfg)
-        found = other if found is None or (other is not None and not other.form_error) else found
+        found = inconsistent_effect(nodes[0], nodes[-1], hypotheses, cfg) or found
     if found is not None and form_corrected and found.share < cfg.max_form_error:
         return replace(found, form_error=True)
     return found
@@ -58,8 +57,9 @@ def inconsistent_effect(
 ) -> UnknownForceFound | None:
     """Return which effect of a model has other values in other windows, as what explains more; None where none has.
 
-    Of several it is the one whose variation explains most of the discrepancy. It is none in whose place another one
-    that the data do not distinguish from it is the same in all windows.
+    Of several it is the one whose variation explains most of the discrepancy; what explains less than an error in its
+    formula may is none. Nor is one in whose place another one that the data do not distinguish from it is the same in
+    all windows.
 
     Args:
         first: The fitted model as given.
@@ -73,20 +73,19 @@ def inconsistent_effect(
     for k, added in enumerate(last.model.effects):
         if added.effect.nominal or added.effect.name in names:
             continue
-        more = _variation_found(first, last, k, cfg)
-        if more is not None and not more.form_error:
-            effects = last.model.effects
-            others = (
-                replace(last.model, effects=(*effects[:k], other, *effects[k + 1 :]))
-                for other in _rivals(added, hypotheses)
-            )
-            fits = (fit_baseline(m, last.windows, last.blocks, last.engine, cfg=last.cfg) for m in others)
-            answers = (_variation_found(first, fit, k, cfg) for fit in fits)
-            if any(answer is None or answer.form_error for answer in answers):
-                continue
-        if more is not None:
+        if (more := _variation_found(first, last, k, cfg)) is None:
+            continue
+        effects = last.model.effects
+        present = [repr(other.effect) for other in effects]
+        others = (
+            replace(last.model, effects=(*effects[:k], other, *effects[k + 1 :]))
+            for other in _rivals(added, hypotheses)
+            if repr(other.effect) not in present
+        )
+        fits = (fit_baseline(m, last.windows, last.blocks, last.engine, cfg=last.cfg) for m in others)
+        if all(_variation_found(first, fit, k, cfg) is not None for fit in fits):
             found.append(more)
-    return max(found, key=lambda f: (not f.form_error, f.share), default=None)
+    return max(found, key=lambda f: f.share, default=None)
 
 
 def _rivals(added: AddedEffect, hypotheses: Hypotheses) -> list[AddedEffect]:
@@ -100,7 +99,7 @@ def _rivals(added: AddedEffect, hypotheses: Hypotheses) -> list[AddedEffect]:
 
 
 def _variation_found(first: FittedModel, one: FittedModel, effect: int, cfg: DiagnoseCfg) -> UnknownForceFound | None:
-    """Return the variation of an effect, by its index, where it is significant; else None."""
+    """Return the variation of an effect, by its index, where it is significant and no error in a formula; else None."""
     more, kind = variation(one, effect, cfg), one.model.effects[effect].effect
     if more.p > cfg.significance_level:
         return None
@@ -108,7 +107,7 @@ def _variation_found(first: FittedModel, one: FittedModel, effect: int, cfg: Dia
     share = one.noise_scale**2 * more.excess / rows / lacked
     least = cfg.small_form_error if kind.exact else cfg.unknown_force.min_share
     words = f"{kind.name} with another value in each window"
-    return UnknownForceFound(words, more.gain, more.p, min(share, 1.0), form_error=share < least)
+    return None if share < least else UnknownForceFound(words, more.gain, more.p, min(share, 1.0))
 
 
 @dataclass(frozen=True)
