@@ -50,6 +50,8 @@ SAME_LEVEL = 1e-9
 """Difference of two readings over the range of all that is rounding of numbers [-]."""
 MIN_GAPS = 20
 """Fewest gaps between readings, most of which never repeat, from which a step is found."""
+UNIFORM_SHARE = 0.9
+"""Share of differences between readings that are as the one before [-], above which the motion is uniform."""
 STEPS_OF_GAPS = (1, 4, 16, 64, 256, 1024, 4096)
 """Largest gaps that refine the step, in steps, one after the other."""
 OFF_STEP = 0.1
@@ -321,7 +323,8 @@ def _resolution(pieces: Sequence[np.ndarray]) -> float:
 def _step(column: np.ndarray) -> float:
     """Return the step of which readings (n,) are multiples, up to a constant and to digits that a log rounds; else 0.
 
-    Readings of a fast motion hardly ever repeat: the step is about the smallest gap between any two.
+    Readings of a fast motion hardly ever repeat: the step is about the smallest gap between any two. Where they do not
+    repeat, and one differs from the next by the same as that from the one after, the motion is uniform and has no step.
     """
     levels = np.unique(column)
     gaps = np.diff(levels)
@@ -329,7 +332,9 @@ def _step(column: np.ndarray) -> float:
     repeated = len(levels) < len(column) / 2
     if not len(gaps) or not (repeated or len(gaps) >= MIN_GAPS):
         return 0.0
-    return max(_refined_step(levels, float(step)) for step in (np.percentile(gaps, 10), gaps.min()))
+    found = max(_refined_step(levels, float(step)) for step in (np.percentile(gaps, 10), gaps.min()))
+    uniform = np.mean(np.abs(np.diff(column, 2)) < found / 2) > UNIFORM_SHARE
+    return 0.0 if uniform and not repeated else found
 
 
 def _refined_step(levels: np.ndarray, step: float) -> float:

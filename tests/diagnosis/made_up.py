@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Finding
+from concent_warp.diagnosis.search import consistency
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.intervals import FittedParameter
@@ -53,11 +56,19 @@ def node(
 
 
 def procedure(**changes: Any) -> Any:
-    """Return a procedure, with settings."""
+    """Return a procedure, with settings; it replays nothing without `explain`: made-up models cannot be simulated."""
     made = Procedure(MODEL, RECORDING, replace(DiagnoseCfg(jobs=1, explain=False), **changes))
     made.seen = []  # pyright: ignore[reportAttributeAccessIssue]
     made.context.runner = TaskRunner(1, lambda share, text: made.seen.append((share, text)))  # pyright: ignore
+    if not made.context.cfg.explain:
+        made._replayed = lambda *_: None  # pyright: ignore
     return made
+
+
+def force_is(monkeypatch: pytest.MonkeyPatch, found: Callable[..., Any]) -> None:
+    """Let a function say which force of no known form is found; no effect varies between windows."""
+    monkeypatch.setattr(consistency, "unknown_force", found)
+    monkeypatch.setattr(consistency, "inconsistent_effect", lambda *_: None)
 
 
 def interval(low: float, null: float = 0.0) -> FittedParameter:

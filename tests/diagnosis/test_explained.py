@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-from concent_warp.diagnosis import procedure as module
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Diagnosis, UnknownForceFound
 from concent_warp.diagnosis.search import additions, context, revision
 from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
-from tests.diagnosis.made_up import FINER, finding, node, procedure
+from tests.diagnosis.made_up import FINER, finding, force_is, node, procedure
 from tests.scenes.swinging import swing_scene
 
 
@@ -66,7 +65,7 @@ def test_the_ratio_up_to_which_an_effect_is_an_explanation_is_a_setting():
 
 
 def test_an_imitation_makes_the_verdict_none_of_these(monkeypatch):
-    monkeypatch.setattr(module, "unknown_force", lambda *_: pytest.fail("more than that is missing"))
+    force_is(monkeypatch, lambda *_: pytest.fail("more than that is missing"))
     made = procedure()
     made.record.findings, made.record.groups = [finding("a", 0.5)], [("a",)]
     found = made.conclude(node(1.5), [node(1.5), node(1.2, effects=1)], (), ())
@@ -88,7 +87,7 @@ def test_a_force_of_no_known_form_decides_where_no_effect_explains_enough_of_lit
     monkeypatch, refused, found, verdict
 ):
     force = None if found is None else UnknownForceFound("a force", 0.2, 0.0025, 0.5, None, form_error=found)
-    monkeypatch.setattr(module, "unknown_force", lambda *_: force)
+    force_is(monkeypatch, lambda *_: force)
     made, given = procedure(), node(1.2)
     made.record.findings, made.record.part_refused = [finding("a", 0.1, accepted=False)], refused
     concluded = made.conclude(given, [given], (), ())
@@ -179,7 +178,7 @@ def test_the_least_share_that_effects_must_explain_is_a_setting():
 
 def test_effects_that_are_named_are_in_the_model_however_much_they_leave(monkeypatch):
     """The share of a discrepancy that is itself hardly above the noise means little."""
-    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    force_is(monkeypatch, lambda *_: None)
     made, given = procedure(), node(1.04)
     made.record.findings, made.record.groups = [finding("a", 0.2)], [("a",)]
     found = made.conclude(given, [given, node(1.035, effects=1)], (), ())

@@ -11,7 +11,7 @@ from concent_warp.diagnosis import procedure as module
 from concent_warp.diagnosis.replayed import Replayed
 from concent_warp.diagnosis.result import UnknownForceFound
 from concent_warp.diagnosis.search import additions, context
-from tests.diagnosis.made_up import FINER, MODEL, RECORDING, finding, node, procedure
+from tests.diagnosis.made_up import FINER, MODEL, RECORDING, finding, force_is, node, procedure
 from tests.scenes.swinging import windows_of
 
 
@@ -66,7 +66,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
 
 def test_a_force_in_the_variables_of_a_corrected_formula_is_its_error(monkeypatch):
     force = UnknownForceFound("a force", 0.3, 0.01, 0.2, None)
-    monkeypatch.setattr(module, "unknown_force", lambda *_: force)
+    force_is(monkeypatch, lambda *_: force)
     for corrected, most, verdict in (
         (True, 0.25, "effect"),
         (True, 0.15, "none_of_these"),
@@ -103,7 +103,7 @@ def test_over_short_windows_time_step_and_nominal_values_stay_as_given(monkeypat
 
 
 def test_the_answer_starts_with_the_model_as_given(monkeypatch):
-    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    force_is(monkeypatch, lambda *_: None)
     given, finer, added = node(3.0), node(1.2, timestep=FINER), node(1.0, timestep=FINER, effects=1)
     found = procedure().conclude(given, [finer, added], (), ())
     assert found.ratio == (30.0, 12.0, 10.0)
@@ -112,7 +112,7 @@ def test_the_answer_starts_with_the_model_as_given(monkeypatch):
 
 
 def test_noise_that_may_be_larger_than_its_estimate_leaves_a_model_adequate(monkeypatch):
-    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    force_is(monkeypatch, lambda *_: None)
     for ratio, factor, verdict in ((1.8, 1.5, "none_needed"), (1.8, 1.4, "none_of_these"), (1.8, 1.0, "none_of_these")):
         made = procedure()
         made.context.noise_factors = {"angle": factor}
@@ -241,7 +241,7 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     ]  # fmt: skip
     # A share below zero stands for an error of form.
     force = None if unknown is None else SimpleNamespace(share=abs(unknown), form_error=unknown < 0)
-    monkeypatch.setattr(module, "unknown_force", lambda nodes, _cfg, _results: force if len(nodes) else None)
+    force_is(monkeypatch, lambda nodes, _cfg, _results: force if len(nodes) else None)
     nodes = [node(r, name=str(r)) for r in ratios]
     found = made.conclude(nodes[0], nodes, ("size",), ["a gap"])
     assert found.verdict == verdict
@@ -270,7 +270,7 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     ],
 )
 def test_of_several_effects_none_leaves_a_part_of_what_is_left_without_it(monkeypatch, gains, ratio, verdict):
-    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    force_is(monkeypatch, lambda *_: None)
     made = procedure()
     made.record.findings = [finding(str(k), gain, step=k) for k, gain in enumerate(gains)]
     made.record.groups = [(f.name,) for f in made.record.findings]
@@ -280,7 +280,7 @@ def test_of_several_effects_none_leaves_a_part_of_what_is_left_without_it(monkey
 
 
 def test_what_is_left_is_no_error_of_form_where_no_effect_was_accepted(monkeypatch):
-    monkeypatch.setattr(module, "unknown_force", lambda *_: pytest.fail("no effect has a formula"))
+    force_is(monkeypatch, lambda *_: pytest.fail("no effect has a formula"))
     for findings in ([], [finding("no", 0.9, accepted=False)]):
         made = procedure()
         made.record.findings = findings
@@ -293,7 +293,7 @@ def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
     said = Replayed(40.0, 1.5, 0.3, False)
     replays: list[tuple[Any, ...]] = []
     monkeypatch.setattr(module, "replayed", lambda *args: replays.append(args) or said)
-    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    force_is(monkeypatch, lambda *_: None)
     monkeypatch.setattr(module, "locate_failures", lambda *args, **more: asked.append((args, more)) or [{"span": 1}])
     monkeypatch.setattr(module, "suggest_experiment", lambda *args, **more: asked.append((args, more)) or "experiment")
     made = procedure(explain=True, seed=7)

@@ -101,6 +101,11 @@ def test_readings_without_steps_have_no_resolution():
     assert channel_noise(Channel(TIME, read), "joint").std == pytest.approx(STD, rel=0.3)
 
 
+def test_a_uniform_motion_without_noise_has_no_resolution():
+    for read in (0.5 * TIME, np.where(TIME.mean() > TIME, 0.5 * TIME, TIME)):
+        assert channel_noise(Channel(TIME, read[:, None]), "joint").source != "resolution"
+
+
 def test_a_slow_creep_is_not_rest():
     rng = np.random.default_rng(4)
     creep = 0.02 * TIME[:, None] + white(rng, (len(TIME), 1))
