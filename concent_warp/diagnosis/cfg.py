@@ -153,7 +153,7 @@ class SearchCfg:
     """Most rivals of the first effect from which the search is continued, too, where an answer reaches the noise [-]; 0
     for none at all. Empirical."""
     alternatives_beyond_noise: Annotated[int, Bounds(0, 1000)] = 3
-    """The same while all answers leave more than noise, and one of them no more than `far_ratio` [-]. Empirical."""
+    """The same while all answers leave more than noise [-]. Empirical."""
     parallel_rivals: Share = 0.95
     """Cosine between what two rivals take from the residuals, from which on the search is continued from the stronger
     alone [-]: less than a tenth of what either takes, in squares, is then its own."""

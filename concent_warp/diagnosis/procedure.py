@@ -209,7 +209,7 @@ class Procedure:
     def baseline_with_errors_of_impacts(self, given: FittedModel, fitted: Sequence[FittedModel]) -> FittedModel | None:
         """Return the model as given where errors of impacts count as noise; None where there are no impacts.
 
-        It is None, too, where the model is far off and nothing was found to follow the motion by.
+        It is None, too, where the model is far off, with what was found as well, if anything, and beside such errors.
 
         Args:
             given: The model as given.
@@ -230,7 +230,10 @@ class Procedure:
             more = [_directions(a) > _directions(b) for a, b in zip(windows, given.windows, strict=True)]
             if any(more):
                 found.append(self._refitted(given.model, windows))
-        return min(found, key=lambda one: one.ratio, default=None)
+        rough, far = min(found, key=lambda one: one.ratio, default=None), self.context.is_far_off
+        if rough is not None and far(fitted[-1], given):
+            return None if far(self._refitted(fitted[-1].model, rough.windows), rough) else rough
+        return rough
 
     def _followed(self, given: FittedModel, last: FittedModel) -> list[FittedModel]:
         """Return the models whose impacts may be those that were measured.

@@ -45,9 +45,8 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
     others = [r for r in rivals if r.finding.name not in equals and r.finding.p <= cfg.significance_level]
     for count in range(_most(cfg.search)):
         ends = [found[-1] for found, _ in answers]
-        far = all(end.ratio > cfg.search.far_ratio for end in ends)
-        enough = count >= cfg.search.alternatives and (far or any(_reaches_noise(context, end) for end in ends))
-        if not others or enough:
+        enough = count >= cfg.search.alternatives and any(_reaches_noise(context, end) for end in ends)
+        if not others or enough or all(context.is_far_off(end, first) for end in ends):
             break
         rival = others.pop(0)
         context.record = begun.copy()

@@ -98,6 +98,18 @@ class SearchContext:
         little = least_ratio(one, self.noise_factors) <= self.cfg.search.explained_ratio
         return (adequate and little) or self.is_form_error(one, first)
 
+    def is_far_off(self, one: FittedModel, first: FittedModel) -> bool:
+        """Return whether a model with added effects leaves far more than noise, and much of the discrepancy.
+
+        Nothing that is combined from what was found explains the data then.
+
+        Args:
+            one: The fitted model.
+            first: The model as given.
+        """
+        left, lacked = discrepancies(one, first)
+        return one.noise_ratio > self.cfg.search.far_ratio and left > self.cfg.search.far_min_gain * lacked
+
     def takes_up_parts(self, last: FittedModel) -> bool:
         """Return whether one of several accepted effects leaves too large a part of what is left without it.
 

@@ -20,6 +20,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis, Finding, FinerTimeStep
 from concent_warp.diagnosis.search import alternatives as module
+from concent_warp.diagnosis.search import context
 from concent_warp.diagnosis.search.alternatives import _from, log_odds, plausibility, try_alternatives
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.effects.effect import Effect
@@ -199,12 +200,12 @@ def test_more_rivals_are_tried_while_all_answers_leave_more_than_noise(greedy, m
     assert begun_from(greedy, monkeypatch, noisy=True, parallel=False) == ["actuator_delay", "joint_damping"]
 
 
-def test_one_rival_is_enough_where_all_answers_are_far_off(greedy, monkeypatch):
-    last = greedy[1][-1].ratio
-    with monkeypatch.context() as patch:
-        found = begun_from(greedy, patch, noisy=True, parallel=False, far_ratio=0.5 * last)
-        assert found == ["actuator_delay"]
-    assert len(begun_from(greedy, monkeypatch, noisy=True, parallel=False, far_ratio=1.1 * last)) == 2
+def test_no_rival_is_tried_where_the_answer_is_far_off_and_leaves_much(greedy, monkeypatch):
+    last, given = greedy[1][-1].noise_ratio, greedy[1][0]
+    assert begun_from(greedy, monkeypatch, noisy=True, parallel=False, far_ratio=1.1 * last)
+    assert begun_from(greedy, monkeypatch, noisy=True, parallel=False, far_ratio=0.5 * last)  # it leaves little
+    monkeypatch.setattr(context, "discrepancies", lambda _, first: (0.3, 1.0) if first is given else (0.0, 1.0))
+    assert not begun_from(greedy, monkeypatch, noisy=True, parallel=False, far_ratio=0.5 * last)
 
 
 def test_a_rival_that_takes_away_what_an_earlier_one_does_is_not_tried(greedy, monkeypatch):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure as module
@@ -119,3 +121,17 @@ def test_beside_a_small_effect_that_stands_a_single_one_beside_errors_of_impacts
     base, _, _ = made.search_beside_impacts(given)
     assert base is {"rough": rough, "given": given}[answer]
     assert [f.name for f in made.record.accepted()] == list(then if answer == "rough" else ("length_scale",))
+
+
+@pytest.mark.parametrize("far", [True, False])
+def test_where_what_was_found_leaves_far_more_than_such_errors_there_is_no_second_search(monkeypatch, far):
+    made, given, last, rough = procedure(), node(3.0), node(2.0, effects=1), node(2.5)
+    for one in (given, last):
+        one.fit, one.windows[0].spread = SimpleNamespace(offsets=[np.zeros(2)]), np.ones(2)
+    monkeypatch.setattr(module, "flying_bodies", lambda _m: ["ball"])
+    monkeypatch.setattr(module, "with_scatter", lambda *_: ["scattered"])
+    monkeypatch.setattr(module, "_directions", lambda w: int(w == "scattered"))
+    monkeypatch.setattr(made, "_followed", lambda *_: [last])
+    monkeypatch.setattr(made, "_refitted", lambda model, _w: rough if model is given.model else "refitted")
+    monkeypatch.setattr(made.context, "is_far_off", lambda one, _first: one is last or (far and one == "refitted"))
+    assert made.baseline_with_errors_of_impacts(given, [given, last]) is (None if far else rough)
