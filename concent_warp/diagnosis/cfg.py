@@ -52,7 +52,9 @@ class SearchCfg:
 
     far_ratio: Positive = 20.0
     """Noise ratio of the model as given beyond which the search begins with shorter windows [-]: over long ones, a
-    motion so far off is no longer in proportion to an effect's size, and fits end in local minima. Empirical."""
+    motion so far off is no longer in proportion to an effect's size, and fits end in local minima. Where an answer
+    leaves as much, and `far_min_gain` of the first discrepancy, no other beginnings of the search are tried.
+    Empirical."""
     contact_ratio: Positive = 3.0
     """What the model as given leaves, in units of the standard deviation of fits [-], where it is off by more than
     `far_ratio` x noise and a body moves freely that can be touched: the noise is raised for the fits until no more is

@@ -29,7 +29,8 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
 
     Answers count that explain as much as the best, or leave no more than noise or errors in formulas: what one explains
     beyond that is weighed by its parameters, sizes and rarity. An answer that the data cannot distinguish from the
-    best, and that differs by one effect, adds that to the group of the one in whose place it stands.
+    best, and that differs by one effect, adds that to the group of the one in whose place it stands. Nothing is tried
+    where all answers so far are far off, see `SearchContext.is_far_off`.
 
     Args:
         additions: The search; its record is that of the returned models afterwards.
