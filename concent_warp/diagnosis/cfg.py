@@ -40,6 +40,11 @@ class CheckDataCfg:
     """Samples below which that ratio is not computed: its standard deviation is then about 0.2 under white noise."""
     max_scatter_ratio: float = 3.0
     """Standard deviation of a channel over its stated noise up to which it may stand still [-]: 3 sigma."""
+    outside_margin: Share = 0.02
+    """How far outside a joint's range readings may be, in shares of the range [-]: a zero that is a little off, and the
+    softness of a stop. Empirical."""
+    max_outside_share: Share = 0.01
+    """Share of readings farther outside, above which it is reported [-]: single outliers are no motion. Empirical."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from concent_warp.scene.scene import Scene
 
 
 def check_data(recording: Recording, cfg: CheckDataCfg | None = None) -> list[str]:
-    """Return a sentence on each gap, missing samples, constant reading or mere noise in a recording's channels."""
+    """Return a sentence on each gap, missing samples, constant reading, noise or position outside a joint's range."""
     cfg, m, found = cfg or CheckDataCfg(), Scene(recording.scene, recording.source).model, []
     orientations = {m.sensor(i).name for i in range(m.nsensor) if kind_and_unit(m, i)[0] == "orientation"}
     for d in recording.demonstrations:
@@ -47,7 +47,36 @@ def check_data(recording: Recording, cfg: CheckDataCfg | None = None) -> list[st
             scatters = alone if stated is None else values.std(axis=0).max(initial=0.0) > cfg.max_scatter_ratio * stated
             if scatters and _is_white(values, cfg):
                 found.append(f"{where}: the readings scatter like noise, no motion shows in them.")
+            elif beyond := _outside_range(m, name, values, cfg):
+                found.append(f"{where}: {beyond}")
     return found
+
+
+def _outside_range(m: mujoco.MjModel, name: str, values: np.ndarray, cfg: CheckDataCfg) -> str:
+    """Return what to say of a joint's positions (T, 1) that its range in the model excludes; empty where it is not so.
+
+    Args:
+        m: The compiled model.
+        name: Name of the channel, which is that of a sensor.
+        values: Measured positions [rad or m].
+        cfg: Thresholds.
+    """
+    sensor = mujoco.mj_name2id(m, int(mujoco.mjtObj.mjOBJ_SENSOR), name)
+    if sensor < 0 or m.sensor_type[sensor] != int(mujoco.mjtSensor.mjSENS_JOINTPOS) or not len(values):
+        return ""
+    joint = int(m.sensor_objid[sensor])
+    if not m.jnt_limited[joint]:
+        return ""
+    low, high = m.jnt_range[joint]
+    margin = cfg.outside_margin * (high - low)
+    if np.mean((values < low - margin) | (values > high + margin)) <= cfg.max_outside_share:
+        return ""
+    unit = kind_and_unit(m, sensor)[1]
+    farthest = float(values.max() if values.max() - high > low - values.min() else values.min())
+    return (
+        f"readings up to {farthest:.3g} {unit} are outside the range of {m.joint(joint).name}, {low:.3g} to {high:.3g}"
+        f" {unit}, where the simulated joint stops. Correct the range, or the unit or zero of the readings."
+    )
 
 
 def _is_white(values: np.ndarray, cfg: CheckDataCfg) -> bool:

@@ -124,9 +124,10 @@ class UnknownForceFound:
         """A sentence on what the force explains."""
         words, gain = f"{self.words[0].upper()}{self.words[1:]}", 100 * self.gain
         if self.form_error:
+            share = f"{100 * self.share:.1f}" if self.share >= 0.0005 else "less than 0.1"
             return (
-                f"{words} explains {100 * self.share:.1f} % of the discrepancy besides: no more than an error in the "
-                "formulas of the accepted effects."
+                f"{words} explains {share} % of the discrepancy besides: no more than an error in the formulas of the "
+                "accepted effects."
             )
         if self.instead is None:
             return f"{words} explains another {gain:.0f} % of the error."
