@@ -28,13 +28,14 @@ if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
 
 Family = Literal["joints", "objects", "contact", "world", "measurement"]
-Kind = Literal["joint", "actuator", "body", "geom", "sensor", "none"]
+Kind = Literal["joint", "tendon", "actuator", "body", "geom", "sensor", "none"]
 Variable = Literal["joint velocity"]
 Reader = Callable[[str, np.ndarray], np.ndarray]
 """Given a sensor's name and times [s], shape (T,), returns what the model predicts then, shape (T, dim)."""
 
 OBJECTS = {
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
     "body": mujoco.mjtObj.mjOBJ_BODY,
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
@@ -331,9 +332,9 @@ class AddedEffect:
 
 
 def _names(m: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the names of a model's joints, actuators, bodies, geoms or sensors."""
-    count = {"joint": m.njnt, "actuator": m.nu, "body": m.nbody, "geom": m.ngeom, "sensor": m.nsensor}[kind]
-    found = [mujoco.mj_id2name(m, OBJECTS[kind], i) for i in range(count)]
+    """Return the names of a model's joints, tendons, actuators, bodies, geoms or sensors."""
+    counts = {"joint": m.njnt, "tendon": m.ntendon, "actuator": m.nu, "body": m.nbody, "geom": m.ngeom}
+    found = [mujoco.mj_id2name(m, OBJECTS[kind], i) for i in range((counts | {"sensor": m.nsensor})[kind])]
     return [name for name in found if name]
 
 

@@ -57,6 +57,7 @@ NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalLength,
     nominal.NominalSize,
     nominal.NominalStiffness,
+    nominal.NominalTendonStiffness,
     nominal.NominalGain,
     nominal.NominalVelocityGain,
     nominal.NominalLatency,

@@ -164,6 +164,38 @@ class NominalStiffness(JointEffect):
         m.jnt_stiffness[self.ids(m)] *= values
 
 
+class NominalTendonStiffness(Effect):
+    """Stiffness of springs that a model has along tendons, within its tolerance."""
+
+    name = "nominal_tendon_stiffness"
+    family = "joints"
+    kind = "tendon"
+    nominal = True
+    summary = "The stiffness of the tendon's spring is the model's times a factor within the tolerance of nominal values."
+    source = "tolerance of nominal values"
+    signature = "residual force along the tendon in proportion to its spring's"
+    confusions = ("joint_stiffness", "joint_friction", "actuator_gain")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the tendons with a name and a spring."""
+        sprung = np.flatnonzero(m.tendon_stiffness)
+        found = tuple(n for t in sprung if (n := element_name(m, mujoco.mjtObj.mjOBJ_TENDON, t)))
+        return (found,) if found else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor a tendon."""
+        return nominal_parameters("stiffness", self.target)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Stiffness."""
+        return ("tendon_stiffness",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale it."""
+        m.tendon_stiffness[self.ids(m)] *= values
+
+
 class NominalGain(ActuatorGain):
     """Gains of actuators within their tolerance."""
 
