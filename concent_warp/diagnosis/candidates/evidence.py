@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from concent_warp.diagnosis.candidates.null_distribution import null_p_value
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
+from concent_warp.fit.effects.cross_validation import Sums, bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.intervals import (
     NORMAL_QUANTILE,
     FittedParameter,
@@ -74,16 +75,26 @@ def assess(
 def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedParameter, ...]:
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
-    The error of the formula itself is included, see `formula_errors`.
+    The error of the formula itself is included, see `formula_errors`. A parameter that is 0 where the model has more,
+    such as friction that is not there, is at a bound only where the data ask for less than 0 by more than its interval.
     """
     prediction = base.prediction(c.effect)
     own = slice(prediction.owned, None)
     parameters, values = prediction.parameters[own], c.fit.values[own]
     reaches = NORMAL_QUANTILE * np.sqrt(np.diag(fitted_covariance(base, c)))
-    return tuple(
-        FittedParameter.within(p, float(value), float(reach))
-        for p, value, reach in zip(parameters, values, reaches, strict=True)
-    )
+    steps = _free_step(c.sums, base.cfg.least_squares.prior)[own] * [p.scale for p in parameters]
+    found = []
+    for p, value, reach, step in zip(parameters, values, reaches, steps, strict=True):
+        one = FittedParameter.within(p, float(value), float(reach))
+        absent = p.low == 0.0 < p.null < np.inf and value - p.low < p.high - value
+        found.append(replace(one, at_bound=False) if one.at_bound and absent and step >= -reach else one)
+    return tuple(found)
+
+
+def _free_step(sums: Sums, prior: float) -> np.ndarray:
+    """Return the linear step to the least error without bounds, in units of the parameters' scales, shape (P,)."""
+    normal = sums.normal.sum(axis=0)
+    return -np.linalg.pinv(normal + np.eye(len(normal)) / prior**2, hermitian=True) @ sums.slope.sum(axis=0)
 
 
 def fitted_covariance(base: FittedModel, c: FittedCandidate) -> np.ndarray:

@@ -171,7 +171,9 @@ class NominalTendonStiffness(Effect):
     family = "joints"
     kind = "tendon"
     nominal = True
-    summary = "The stiffness of the tendon's spring is the model's times a factor within the tolerance of nominal values."
+    summary = (
+        "The stiffness of the tendon's spring is the model's times a factor within the tolerance of nominal values."
+    )
     source = "tolerance of nominal values"
     signature = "residual force along the tendon in proportion to its spring's"
     confusions = ("joint_stiffness", "joint_friction", "actuator_gain")
