@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import BOUND_DISTANCE
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.candidates.candidates import label
 from concent_warp.diagnosis.candidates.null_distribution import null_p_value
@@ -82,13 +83,19 @@ def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedPara
     own = slice(prediction.owned, None)
     parameters, values = prediction.parameters[own], c.fit.values[own]
     reaches = NORMAL_QUANTILE * np.sqrt(np.diag(fitted_covariance(base, c)))
-    steps = _free_step(c.sums, base.cfg.least_squares.prior)[own] * [p.scale for p in parameters]
-    found = []
-    for p, value, reach, step in zip(parameters, values, reaches, steps, strict=True):
-        one = FittedParameter.within(p, float(value), float(reach))
-        absent = p.low == 0.0 < p.null < np.inf and value - p.low < p.high - value
-        found.append(replace(one, at_bound=False) if one.at_bound and absent and step >= -reach else one)
-    return tuple(found)
+    found = tuple(
+        FittedParameter.within(p, float(value), float(reach))
+        for p, value, reach in zip(parameters, values, reaches, strict=True)
+    )
+    absent = [
+        q.at_bound and p.low == 0.0 < p.null < np.inf and abs(q.value) < BOUND_DISTANCE * p.scale
+        for p, q in zip(parameters, found, strict=True)
+    ]
+    if not any(absent):
+        return found
+    beyond = _free_step(c.sums, base.cfg.least_squares.prior)[own] * [p.scale for p in parameters] < -reaches
+    pairs = zip(found, absent, beyond, strict=True)
+    return tuple(replace(q, at_bound=bool(asked)) if gone else q for q, gone, asked in pairs)
 
 
 def _free_step(sums: Sums, prior: float) -> np.ndarray:
