@@ -56,6 +56,32 @@ def test_an_integrator_of_a_servo_with_an_offset_begins_without_a_force():
     assert d.act[1] == 0.0
 
 
+@pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
+def test_an_integrator_of_a_servo_begins_where_it_holds_weight_and_spring(engine):
+    scene = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+    <body><joint name="lift" axis="0 1 0" damping="1" stiffness="3" springref="20"/>
+    <geom size="0.02" pos="0.3 0 0" mass="1"/></body></worldbody>
+    <actuator><intvelocity name="servo" joint="lift" kp="20" kv="1" gear="2"/></actuator></mujoco>"""
+    qpos = np.array([[0.4], [-0.2]])
+    found = engine(Model(Scene(scene))).run(Variants(2, qpos=qpos), np.zeros((2, 200, 1))).numpy()
+    np.testing.assert_allclose(found.qpos, np.repeat(qpos[:, None], 201, axis=1), atol=1e-4)
+
+
+def test_an_integrator_pulls_no_more_than_it_can_and_not_where_another_drive_may_hold_the_joint():
+    def force(limit: str, other: str) -> float:
+        m = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody><body><joint name="j" axis="0 1 0"/>
+        <geom size="0.02" pos="0.3 0 0" mass="1"/></body></worldbody>
+        <actuator><intvelocity joint="j" kp="20" {limit}/>{other}</actuator></mujoco>""")
+        d = mujoco.MjData(m)
+        d.act[:] = initial_activation(m, d, np.zeros(m.nu))
+        mujoco.mj_forward(m, d)
+        return float(d.actuator_force[0])
+
+    assert force("", "") == pytest.approx(-0.3 * 9.81)
+    assert force('forcerange="-1 1"', "") == pytest.approx(-1.0)
+    assert force("", '<motor joint="j"/>') == pytest.approx(0.0)
+
+
 def test_a_command_is_not_clipped_where_the_scene_says_so():
     m = mujoco.MjModel.from_xml_string("""<mujoco><option><flag clampctrl="disable"/></option><worldbody>
     <body><joint name="j"/><geom size="0.1"/></body></worldbody><actuator>
