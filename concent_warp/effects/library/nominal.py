@@ -182,7 +182,7 @@ class NominalTendonStiffness(Effect):
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the tendons with a name and a spring."""
         sprung = np.flatnonzero(m.tendon_stiffness)
-        found = tuple(n for t in sprung if (n := element_name(m, mujoco.mjtObj.mjOBJ_TENDON, t)))
+        found = tuple(n for t in sprung if (n := element_name(m, mujoco.mjtObj.mjOBJ_TENDON, int(t))))
         return (found,) if found else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
