@@ -17,6 +17,7 @@ from concent_warp.diagnosis.forces.features import CONTACT, joint_features
 from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
 from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.forces.window_forces import Windows, window_forces, window_length
+from concent_warp.effects.select import driven_joints
 from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
 from concent_warp.files import write_json
 from concent_warp.simulate.select import EngineName, make_engine
@@ -93,10 +94,15 @@ def _ignore(share: float) -> None:
 
 
 def _all_joints(motions: Sequence[StateEstimator]) -> list[tuple[str, str, int]]:
-    """Return name, unit of force and degree of freedom of the joints measured in any demonstration."""
-    return sorted(
-        {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for m in motions for j in m.joints}, key=lambda j: j[2]
-    )
+    """Return name, unit of force and degree of freedom of the joints measured in any demonstration.
+
+    Those that an actuator with a state drives are left out: where a window begins in the middle of a motion, no
+    instrument tells the state of its filter or integrator, and its force would be taken for one that the model lacks.
+    """
+    m = motions[0].compiled
+    stateful = {j for a in np.flatnonzero(m.actuator_actadr >= 0) for j in driven_joints(m, int(a))}
+    found = {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for motion in motions for j in motion.joints}
+    return sorted((j for j in found if int(m.dof_jntid[j[2]]) not in stateful), key=lambda j: j[2])
 
 
 def _all_bodies(motions: Sequence[StateEstimator]) -> list[str]:
