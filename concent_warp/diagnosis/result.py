@@ -124,10 +124,9 @@ class UnknownForceFound:
         """A sentence on what the force explains."""
         words, gain = f"{self.words[0].upper()}{self.words[1:]}", 100 * self.gain
         if self.form_error:
-            share = f"{100 * self.share:.1f}" if self.share >= 0.0005 else "less than 0.1"
             return (
-                f"{words} explains {share} % of the discrepancy besides: no more than an error in the formulas of the "
-                "accepted effects."
+                f"{words} explains {_percent(self.share)} of the discrepancy besides: no more than an error in the "
+                "formulas of the accepted effects."
             )
         if self.instead is None:
             return f"{words} explains another {gain:.0f} % of the error."
@@ -379,7 +378,7 @@ class Diagnosis:
         said = []
         if self.form_error is not None:
             said.append(
-                f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no "
+                f"What is left, {self.ratio[-1]:.2f} x noise, is {_percent(self.form_error)} of the discrepancy: no "
                 "more than errors in the formulas of the accepted effects."
             )
         if self.remainder_searched is False:
@@ -412,8 +411,8 @@ class Diagnosis:
             lead = "The best so far" if self.verdict == "unsettled" else lead
             lead = "Explains a part" if self.verdict == "none_of_these" else lead
             said.append(
-                f"{lead}: {finding.name} ({values}). Held-out error falls by {100 * finding.gain:.0f} % "
-                f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
+                f"{lead}: {finding.name}{_owner(finding)} ({values}). "
+                f"Held-out error falls by {100 * finding.gain:.0f} % [{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
             )
             if len(group) > 1:
                 said.append(f"The data cannot distinguish it from {_joined(group[1:])}.")
@@ -444,6 +443,17 @@ class Diagnosis:
         if self.farther and not self.accepted:
             numerical.append(FARTHER)
         return [*self.issues, *numerical, *said, *self.unsettled]
+
+
+def _percent(share: float) -> str:
+    """Return a small share in per cent, to a tenth of one."""
+    return f"{100 * share:.1f} %" if share >= 0.0005 else "less than 0.1 %"
+
+
+def _owner(finding: Finding) -> str:
+    """Return what a single target adds to the name of an effect: nothing where the name or the parameters tell it."""
+    told = "(" in finding.name or any("[" in p.name for p in finding.parameters)
+    return f" of {finding.target[0]}" if len(finding.target) == 1 and not told else ""
 
 
 def _table_rows(finding: Finding) -> list[tuple[str, ...]]:
