@@ -412,7 +412,8 @@ class Diagnosis:
             lead = "Explains a part" if self.verdict == "none_of_these" else lead
             said.append(
                 f"{lead}: {finding.name}{_owner(finding)} ({values}). "
-                f"Held-out error falls by {100 * finding.gain:.0f} % [{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
+                f"Held-out error falls by {100 * finding.gain:.0f} % "
+                f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
             )
             if len(group) > 1:
                 said.append(f"The data cannot distinguish it from {_joined(group[1:])}.")
