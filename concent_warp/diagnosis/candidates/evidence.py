@@ -23,6 +23,9 @@ from concent_warp.fit.effects.intervals import (
     formula_errors,
 )
 
+FORMULA_ACCURACY = 0.25
+"""Share of what a model has by which its formulas are off outside a simulator [-], as for `UnknownForceCfg`."""
+
 
 def assess(
     base: FittedModel, c: FittedCandidate, null: np.ndarray, step: int, among: Sequence[Effect], cfg: DiagnoseCfg
@@ -77,7 +80,8 @@ def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedPara
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
     The error of the formula itself is included, see `formula_errors`. A parameter that is 0 where the model has more,
-    such as friction that is not there, is at a bound only where the data ask for less than 0 by more than its interval.
+    such as friction that is not there, is at a bound only where the data ask for less than 0 by more than its interval,
+    and by more than the accuracy of formulas.
     """
     prediction = base.prediction(c.effect)
     own = slice(prediction.owned, None)
@@ -93,7 +97,10 @@ def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedPara
     ]
     if not any(absent):
         return found
-    beyond = _free_step(c.sums, base.cfg.least_squares.prior)[own] * [p.scale for p in parameters] < -reaches
+    allowed = np.maximum(
+        reaches, [FORMULA_ACCURACY * p.null if gone else 0.0 for p, gone in zip(parameters, absent, strict=True)]
+    )
+    beyond = _free_step(c.sums, base.cfg.least_squares.prior)[own] * [p.scale for p in parameters] < -allowed
     pairs = zip(found, absent, beyond, strict=True)
     return tuple(replace(q, at_bound=bool(asked)) if gone else q for q, gone, asked in pairs)
 

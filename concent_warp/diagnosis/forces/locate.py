@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 
 from concent_warp.checks import check_settings
@@ -72,7 +73,9 @@ def locate_forces(
         windows.append(window_forces(d.name, simulator, motion, cfg))
         report(0.1 + 0.6 * (k + 1) / len(chosen))
     features = [joint_features(w, m, cfg.features) for w, m in zip(windows, motions, strict=True)]
-    joints = [_joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in _all_joints(motions)]
+    unknown = _driven_with_a_state(motions[0].compiled)
+    shown = [joint for joint in _all_joints(motions) if joint[2] not in unknown]
+    joints = [_joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in shown]
     bodies = [body_force(model, name, motions, windows, cfg) for name in _all_bodies(motions)]
     accepted = _holm([f.p for f in joints] + [f.p for f in bodies], cfg.dependence.level)
     joints = [
@@ -94,15 +97,20 @@ def _ignore(share: float) -> None:
 
 
 def _all_joints(motions: Sequence[StateEstimator]) -> list[tuple[str, str, int]]:
-    """Return name, unit of force and degree of freedom of the joints measured in any demonstration.
+    """Return name, unit of force and degree of freedom of the joints measured in any demonstration."""
+    return sorted(
+        {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for m in motions for j in m.joints}, key=lambda j: j[2]
+    )
 
-    Those that an actuator with a state drives are left out: where a window begins in the middle of a motion, no
-    instrument tells the state of its filter or integrator, and its force would be taken for one that the model lacks.
+
+def _driven_with_a_state(m: mujoco.MjModel) -> set[int]:
+    """Return the degrees of freedom that an actuator with a state drives.
+
+    Where a window begins in the middle of a motion, no instrument tells the state of its filter or integrator, and its
+    force would be taken for one that the model lacks.
     """
-    m = motions[0].compiled
-    stateful = {j for a in np.flatnonzero(m.actuator_actadr >= 0) for j in driven_joints(m, int(a))}
-    found = {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for motion in motions for j in motion.joints}
-    return sorted((j for j in found if int(m.dof_jntid[j[2]]) not in stateful), key=lambda j: j[2])
+    joints = {j for a in np.flatnonzero(m.actuator_actadr >= 0) for j in driven_joints(m, int(a))}
+    return {dof for dof in range(m.nv) if int(m.dof_jntid[dof]) in joints}
 
 
 def _all_bodies(motions: Sequence[StateEstimator]) -> list[str]:
