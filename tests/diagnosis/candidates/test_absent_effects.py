@@ -26,7 +26,7 @@ damping="{damping}"/><geom name="arm" type="sphere" size="0.01" pos="0 0 -0.2" m
 
 
 @pytest.mark.parametrize(("growth", "at_bound"), [(0.0, False), (0.015, False), (0.1, True)])
-def test_damping_that_is_not_there_is_at_no_bound_unless_the_motion_grows_by_more_than_formulas_are_off(growth, at_bound):
+def test_damping_that_is_not_there_is_at_no_bound_unless_the_motion_grows(growth, at_bound):
     truth, model = Model(Scene(XML.format(damping=0.0))), Model(Scene(XML.format(damping=0.002)))
     start = Variants(1, qpos=np.array([[0.2]]), qvel=np.zeros((1, 1)))
     swing = MujocoEngine(truth).run(start, np.zeros((1000, 0))).numpy()
