@@ -23,6 +23,8 @@ from concent_warp.fit.effects.intervals import (
     formula_errors,
 )
 
+AT_NULL = "its parameters may be at their null values"
+"""Why a candidate is refused whose intervals all include the values that change nothing."""
 FORMULA_ACCURACY = 0.25
 """Share of what a model has by which its formulas are off outside a simulator [-], as for `UnknownForceCfg`."""
 
@@ -55,7 +57,7 @@ def assess(
     elif folds[folds > 0].sum() < cfg.search.min_fold_share * np.abs(folds).sum():
         reason = "folds disagree"
     elif not excludes_null(parameters, fitted_covariance(base, c), cfg.search.dependent_share):
-        reason = "its parameters may be at their null values"
+        reason = AT_NULL
     elif any(q.at_bound for q in parameters):
         reason = "a parameter is at its bound"
     return Finding(
@@ -76,17 +78,48 @@ def assess(
     )
 
 
-def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedParameter, ...]:
+def with_scattering(
+    base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding], cfg: SearchCfg
+) -> list[Finding]:
+    """Return findings, one accepted that explains more than all accepted ones and was refused for its scatter alone.
+
+    Its null value scatters between measurements by more than the fitted one differs from it, as that of a rebound does.
+    Where other effects explain nearly as much, such a difference is no reason to name it; where all others explain
+    clearly less, each of them would stand for it.
+
+    Args:
+        base: The fitted baseline.
+        fitted: The candidates.
+        findings: Their evidence, in the same order.
+        cfg: Settings.
+    """
+    found, accepted = list(findings), [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
+    if not accepted:
+        return found
+    best = max(fitted, key=lambda c: c.share(base))
+    k = next(i for i, c in enumerate(fitted) if c is best)
+    least = min(accepted, key=lambda c: c.errors.sum())
+    if found[k].reason != AT_NULL or not leaves_more(least.errors, best.errors, cfg):
+        return found
+    parameters = fitted_parameters(base, best, null_known=True)
+    if excludes_null(parameters, fitted_covariance(base, best, null_known=True), cfg.dependent_share):
+        found[k] = replace(found[k], accepted=True, reason="")
+    return found
+
+
+def fitted_parameters(
+    base: FittedModel, c: FittedCandidate, *, null_known: bool = False
+) -> tuple[FittedParameter, ...]:
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
-    The error of the formula itself is included, see `formula_errors`. A parameter that is 0 where the model has more,
-    such as friction that is not there, is at a bound only where the data ask for less than 0 by more than its interval,
-    and by more than the accuracy of formulas.
+    The error of the formula itself is included, see `formula_errors`, also for `null_known`. A parameter that is 0
+    where the model has more, such as friction that is not there, is at a bound only where the data ask for less than 0
+    by more than its interval, and by more than the accuracy of formulas.
     """
     prediction = base.prediction(c.effect)
     own = slice(prediction.owned, None)
     parameters, values = prediction.parameters[own], c.fit.values[own]
-    reaches = NORMAL_QUANTILE * np.sqrt(np.diag(fitted_covariance(base, c)))
+    reaches = NORMAL_QUANTILE * np.sqrt(np.diag(fitted_covariance(base, c, null_known=null_known)))
     found = tuple(
         FittedParameter.within(p, float(value), float(reach))
         for p, value, reach in zip(parameters, values, reaches, strict=True)
@@ -111,7 +144,7 @@ def _free_step(sums: Sums, prior: float) -> np.ndarray:
     return -np.linalg.pinv(normal + np.eye(len(normal)) / prior**2, hermitian=True) @ sums.slope.sum(axis=0)
 
 
-def fitted_covariance(base: FittedModel, c: FittedCandidate) -> np.ndarray:
+def fitted_covariance(base: FittedModel, c: FittedCandidate, *, null_known: bool = False) -> np.ndarray:
     """Return the covariance of a candidate's own parameters, in their units (P, P), see `fitted_parameters`."""
     prediction = base.prediction(c.effect)
     own = slice(prediction.owned, None)
@@ -119,7 +152,7 @@ def fitted_covariance(base: FittedModel, c: FittedCandidate) -> np.ndarray:
     found = covariance(c.sums, base.blocks, base.cfg.least_squares.prior)[own, own]
     scale, std = np.array([p.scale for p in parameters]), np.sqrt(np.diag(found))
     wide = scale * (1.0 if c.std is None else c.std[own] / std)
-    formula = formula_errors(c.effect, parameters, values, base.cfg.discretisation_error)
+    formula = formula_errors(c.effect, parameters, values, base.cfg.discretisation_error, null_known=null_known)
     return found * np.outer(wide, wide) + np.diag(formula**2)
 
 

@@ -15,7 +15,14 @@ import numpy as np
 from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_from_rivals
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.candidates.candidates import candidates, label
-from concent_warp.diagnosis.candidates.evidence import assess, detectable_size, leaves_more, profile_widening
+from concent_warp.diagnosis.candidates.evidence import (
+    AT_NULL,
+    assess,
+    detectable_size,
+    leaves_more,
+    profile_widening,
+    with_scattering,
+)
 from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
 from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
@@ -124,6 +131,8 @@ class AdditionFinder:
             findings = [finding(c) for c in fitted]
         if explained:
             findings = self._established(base, fitted, findings, quiet=quiet)
+        elif not quiet:
+            findings = with_scattering(base, fitted, findings, cfg.search)
         whole = [f for f in findings if f.accepted and f.gain >= self._least_share(base)]
         context.record.part_refused = not whole and any(f.accepted for f in findings)
         if context.record.part_refused:
@@ -217,7 +226,7 @@ class AdditionFinder:
             found[k] = replace(f, parameters=parameters[-1])
             share = self.context.cfg.search.dependent_share
             if not established_effects(added, parameters, share, widening, nominal)[-1]:
-                found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
+                found[k] = replace(found[k], accepted=False, reason=AT_NULL)
             elif quiet and f.gain < self.context.cfg.quiet_min_gain:
                 if f.family == "measurement" and not self.context.record.beside_impacts:
                     found[k] = replace(found[k], accepted=False, reason="removes little, as calibrations do")

@@ -20,7 +20,7 @@ from concent_warp.diagnosis.candidates.baseline import (
     without_effect,
 )
 from concent_warp.diagnosis.candidates.candidate import FittedModel
-from concent_warp.diagnosis.candidates.evidence import profile_widening
+from concent_warp.diagnosis.candidates.evidence import AT_NULL, profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
 from concent_warp.diagnosis.search.holding import with_scene
@@ -282,9 +282,9 @@ class Revision:
             reduced = self._with_nominal_instead(refitted, last)
             if not self.context.explains(reduced, first, added=len(accepted) > 1):
                 continue
-            reason = "its parameters may be at their null values beside the others"
+            reason = f"{AT_NULL} beside the others"
             if len(accepted) == 1:
-                reason = "its parameters may be at their null values"
+                reason = AT_NULL
             elif self.hurried:
                 reason = "there was no time to tell it from errors of nominal values"
             self.context.record.remove(f, reason)

@@ -164,15 +164,19 @@ def formula_errors(
     values: np.ndarray,
     discretisation_error: float,
     timestep: float = 0.0,
+    *,
+    null_known: bool = False,
 ) -> np.ndarray:
     """Return standard deviations of an effect's values due to its formula, in the units of these, shape (P,).
 
     Those of `discretisation_errors`, together with `Effect.formula_error` times each parameter's difference from its
-    null value, `Effect.null_error` times that, and `Effect.step_error` times the model's time step [s].
+    null value, `Effect.null_error` times that, unless the null value is taken to be known, and `Effect.step_error`
+    times the model's time step [s].
     """
     null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
     own = np.where(np.isfinite(values), np.abs(values - null), 0.0)
-    form = np.hypot(np.hypot(effect.formula_error * own, effect.null_error * null), effect.step_error * timestep)
+    scatter = 0.0 if null_known else effect.null_error
+    form = np.hypot(np.hypot(effect.formula_error * own, scatter * null), effect.step_error * timestep)
     return np.hypot(discretisation_errors(parameters, values, discretisation_error), form)
 
 
