@@ -201,7 +201,7 @@ def tracked(
 def page(rows: dict[str, dict[str, Any]]) -> str:
     """Return the page."""
     heads = ["experiment, hidden effect", "position [mm], rotation [deg]", "lost", "from video", "from instruments"]
-    names = [case.name for case in sets(SHIFT)]
+    names = [c.name for c in sets(SHIFT) if any(f"{c.name}/{source}" in rows for source in SOURCES)]
     text = f"# Hidden effects from video\n\n{INTRODUCTION}\n{machines(rows)}\n\n{counts(names, rows)}"
     text += "\n\nBar: named from tracked poses in 80 % of 20 sets. **Bold**: exactly right, named alone or in a group"
     text += "\nof two and nothing else. A *+* separates effects, *or* those of a group.\n\n"
