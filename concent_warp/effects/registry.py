@@ -54,6 +54,7 @@ OURS: tuple[type[Effect], ...] = (
 
 NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalMass,
+    nominal.NominalInertia,
     nominal.NominalLength,
     nominal.NominalSize,
     nominal.NominalStiffness,

@@ -78,6 +78,28 @@ class NominalMass(NominalBodyValue):
         m.body_inertia[ids] *= values[:, None]
 
 
+class NominalInertia(NominalBodyValue):
+    """Inertia of bodies about their centre of mass within its tolerance."""
+
+    name = "nominal_inertia"
+    summary = "The inertia is the model's times a factor within the tolerance of nominal values; the mass stays."
+    signature = "residual torque in proportion to angular acceleration"
+    confusions = ("inertia", "armature")
+    part_of = "inertia"
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor a body."""
+        return nominal_parameters("inertia", self.target)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Inertia."""
+        return ("body_inertia",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale it."""
+        m.body_inertia[self.ids(m)] *= values[:, None]
+
+
 class NominalLength(NominalBodyValue):
     """Lengths of links within their tolerance."""
 
