@@ -83,7 +83,8 @@ def simulate_steps(
     """Simulate the commands `ctrl`, shape (K, nu), into `result`; returns whether the state stayed valid.
 
     `mj_step` computes sensors, poses and contacts from the state before the step and leaves them in `d`, so they are
-    read after the step that they belong to. Only Runge-Kutta overwrites them, with those of its last stage.
+    read after the step that they belong to. Only Runge-Kutta overwrites poses and contacts, with those of its last
+    stage; sensors it leaves.
     """
     row_of = {int(step): row for row, step in enumerate(run.record)}
     record_contacts = run.contacts != "none"
@@ -125,7 +126,7 @@ def simulate_steps(
 def records_states_only(m: mujoco.MjModel, run: SimulationRun) -> bool:
     """Return whether only states and sensors are recorded, so that MuJoCo can step without interruption."""
     state = mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
-    plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and state == 1 + m.nq + m.nv and not m.nmocap
+    plain = state == 1 + m.nq + m.nv and not m.nmocap
     return run.contacts == "none" and not len(run.body_ids) and run.steps > 0 and plain
 
 

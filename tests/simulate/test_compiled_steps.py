@@ -32,8 +32,8 @@ VALUES = {
 }
 
 
-def run(names):
-    model = Model(Scene(ROBOT))
+def run(names, integrator="implicitfast", bodies=()):
+    model = Model(Scene(ROBOT.replace("implicitfast", integrator)))
     for name in names:
         model = model.add(effect_class(name)("shoulder"))
     engine = MujocoEngine(model, threads=1)
@@ -45,10 +45,11 @@ def run(names):
     ctrl = np.sin(np.arange(STEPS) * 0.02)[None, :, None] * np.array([1.5, -0.7])
     record = [0, 1, 7, 100, STEPS]
     return engine.run(
-        Variants(2, qpos=np.array([[0.3, -0.2]] * 2), force_models=tuple(found)), ctrl, record=record, bodies=[]
+        Variants(2, qpos=np.array([[0.3, -0.2]] * 2), force_models=tuple(found)), ctrl, record=record, bodies=bodies
     )
 
 
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
 @pytest.mark.parametrize(
     "names",
     [
@@ -60,17 +61,18 @@ def run(names):
     ],
     ids="+".join,
 )
-def test_compiled_steps_find_what_python_finds_to_the_last_bit(names, monkeypatch):
+def test_compiled_steps_find_what_python_finds_to_the_last_bit(names, integrator, monkeypatch):
     calls = []
     original = compiled_forces.step
     monkeypatch.setattr("concent_warp.simulate.compiled_steps.step", lambda *a: (calls.append(1), original(*a)))
-    compiled = run(names)
+    compiled = run(names, integrator)
     assert len(calls) == 2
     monkeypatch.setattr(mujoco_engine, "can_step", lambda _: False)
-    python = run(names)
+    python, watched = run(names, integrator), run(names, integrator, bodies=None)
     assert len(calls) == 2
     for name in ("qpos", "qvel", "sensordata"):
         np.testing.assert_array_equal(getattr(compiled, name), getattr(python, name))
+        np.testing.assert_allclose(getattr(watched, name), getattr(python, name), rtol=1e-9, atol=1e-12)
     assert np.ptp(compiled.qpos[:, -1, 0]) > 1e-4
 
 

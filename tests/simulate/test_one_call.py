@@ -33,6 +33,29 @@ def test_stepping_in_one_call_records_the_same_to_the_last_bit():
         np.testing.assert_array_equal(getattr(unwatched, name), getattr(watched, name))
 
 
+def test_the_sensors_of_runge_kutta_are_those_of_recorded_states():
+    scene = SERVO.replace("implicitfast", "RK4").replace(
+        "<sensor>",
+        '<sensor><accelerometer site="tip"/><touch site="under"/><jointactuatorfrc joint="hinge"/>'
+        '<velocimeter site="tip"/>',
+    )
+    scene = scene.replace(
+        '<freejoint/><geom size=".03"/>', '<freejoint/><geom size=".03"/><site name="under" size=".04"/>'
+    )
+    scene = scene.replace('mass=".5"/>', 'mass=".5"/><site name="tip" pos="0 0 -.1"/>')
+    engine = MujocoEngine(Model(Scene(scene)), threads=1)
+    ctrl = np.sin(np.arange(350) * 0.02)[:, None] * [1.0, 0.0]
+    mass = np.stack([engine.compiled.body_mass * scale for scale in (1.0, 1.5, 1.0)])
+    qpos = np.tile(engine.compiled.qpos0, (3, 1))
+    qpos[:, 0] = 0.0, 0.1, 0.2
+    variants, record = Variants(3, fields={"body_mass": mass}, qpos=qpos), np.arange(0, 351, 7)
+    together, one_by_one = (engine.run(variants, ctrl, record=record, bodies=bodies) for bodies in ([], None))
+    assert one_by_one.sensordata[:, :, 3].max() > 1  # the ball touches the floor
+    for name in ("qpos", "qvel"):
+        np.testing.assert_array_equal(getattr(together, name), getattr(one_by_one, name))
+    np.testing.assert_allclose(together.sensordata, one_by_one.sensordata, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("bodies", [None, []])
 def test_a_run_that_diverges_says_so_and_keeps_what_was_sane(bodies):
     ctrl = np.zeros((350, 2))
