@@ -98,8 +98,10 @@ def with_scattering(
         return found
     best = max(fitted, key=lambda c: c.share(base))
     k = next(i for i, c in enumerate(fitted) if c is best)
+    if found[k].reason != AT_NULL:
+        return found
     least = min(accepted, key=lambda c: c.errors.sum())
-    if found[k].reason != AT_NULL or not leaves_more(least.errors, best.errors, cfg):
+    if not leaves_more(least.errors, best.errors, cfg):
         return found
     parameters = fitted_parameters(base, best, null_known=True)
     if excludes_null(parameters, fitted_covariance(base, best, null_known=True), cfg.dependent_share):

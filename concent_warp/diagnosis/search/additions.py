@@ -48,7 +48,7 @@ class Additions:
             fitted: The model as given and after earlier additions.
             detectable: Smallest detectable sizes as far as they are known.
             effects_alone: Whether time step and nominal values stay as they are: over short windows the initial states
-                hide what they change.
+                hide what they change. Where nominal values explain what the first effects leave, no more are added.
         """
         context, record, fitted, first = self.context, self.context.record, list(fitted), fitted[0]
         cfg, factors = context.cfg, context.noise_factors
@@ -65,6 +65,8 @@ class Additions:
                     record.provisional = step
                 elif step > record.provisional:
                     break
+            if step and effects_alone and self._is_within_tolerances(fitted[-1], first):
+                break
             if step and not effects_alone:
                 fitted[-1] = self.with_holding(fitted[-1])
             finer = None if effects_alone else self._finer(fitted[-1])
@@ -128,6 +130,14 @@ class Additions:
                 break
             fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
         return fitted, detectable
+
+    def _is_within_tolerances(self, one: FittedModel, first: FittedModel) -> bool:
+        """Return whether nominal values within their tolerance leave no more than noise or errors in formulas."""
+        found = self.context.nominal(one)
+        if found is None:
+            return False
+        lacking = is_lacking(found, self.context.noise_factors, self.context.cfg)
+        return not lacking or self.context.is_form_error(found, first)
 
     def _is_at_bounds(self, one: FittedModel) -> bool:
         """Return whether nominal values of a model are at their bounds, and more than noise is left."""

@@ -346,3 +346,23 @@ def test_an_effect_whose_rivals_were_not_fitted_in_time_is_not_added_to_one_that
         assert len(made.record.groups) == count - 1
         steps = [f.step for f in made.record.accepted()]
         assert made.context.budget.verdict("effect", steps) == ("unsettled" if first == 2.0 else "effect")
+
+
+@pytest.mark.parametrize(("within", "count"), [(1.0, 2), (2.9, 3), (None, 3)])
+def test_over_short_windows_nothing_is_added_to_an_effect_beside_which_nominal_values_explain_the_rest(
+    monkeypatch, within, count
+):
+    made, nodes = procedure(), [node(9.0), node(3.0, effects=1), node(1.0, effects=2)]
+    found = None if within is None else node(within, effects=1)
+    asked = []
+
+    def with_nominal_values(one, *_):
+        asked.append(one)
+        return found
+
+    monkeypatch.setattr(context, "with_nominal_values", with_nominal_values)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
+    monkeypatch.setattr(made.additions.finder, "find", one_after_the_other(made, nodes))
+    assert made.additions.add_effects(nodes[:1], (), effects_alone=True)[0] == nodes[:count]
+    assert asked == [nodes[1]]

@@ -169,6 +169,7 @@ def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any)
     assert asked == [(nodes[1], ())]
     assert made.record.holding == ("joints",)
     alone = procedure(max_additions=1)
+    monkeypatch.setattr(alone.context, "nominal", lambda *_: None)
     monkeypatch.setattr(alone.additions.finder, "find", lambda *_, **__: (nodes[1], ()))
     assert alone.additions.add_effects(nodes[:1], (), effects_alone=True)[0] == nodes[:2]
     assert len(asked) == 1
