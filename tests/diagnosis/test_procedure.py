@@ -82,9 +82,10 @@ def test_a_force_in_the_variables_of_a_corrected_formula_is_its_error(monkeypatc
 
 def test_over_short_windows_time_step_and_nominal_values_stay_as_given(monkeypatch):
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: pytest.fail("a shorter time step is tried"))
-    monkeypatch.setattr(context, "with_nominal_values", lambda *_: pytest.fail("nominal values are fitted"))
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
     made, coarse, given = procedure(), [node(5.0), node(3.0), node(2.0)], node(30.0)
+    # Beside an effect they are fitted to see whether they explain the rest, and are not kept.
+    monkeypatch.setattr(context, "with_nominal_values", lambda one, *_: coarse[2] if one in coarse[1:] else given)
     monkeypatch.setattr(
         made.additions.finder, "find", lambda _base, step, **_: (coarse[step + 1] if step < 2 else None, ("size",))
     )

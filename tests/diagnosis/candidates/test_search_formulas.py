@@ -246,7 +246,7 @@ def test_plausibility_is_schwarzs_criterion_with_a_cauchy_prior():
 
 
 def test_intervals_of_parameters_end_at_their_bounds(monkeypatch):
-    monkeypatch.setattr(evidence, "formula_errors", lambda *_: np.array([0.3, 0.0, 0.0]))
+    monkeypatch.setattr(evidence, "formula_errors", lambda *_, **__: np.array([0.3, 0.0, 0.0]))
     monkeypatch.setattr(evidence, "covariance", lambda *_: np.diag([1.0, 4.0, 9.0, 16.0]))
     base = base_of()
     found = {p.name: p for p in fitted_parameters(base, fitted(np.ones(COUNT)))}
