@@ -78,8 +78,19 @@ class NominalMass(NominalBodyValue):
         m.body_inertia[ids] *= values[:, None]
 
 
-class NominalInertia(NominalBodyValue):
-    """Inertia of bodies about their centre of mass within its tolerance."""
+class NominalLinkValue(NominalBodyValue):
+    """A nominal value of links."""
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the bodies that hang on others by joints."""
+        free = {element_name(m, mujoco.mjtObj.mjOBJ_BODY, b) for b in free_bodies(m)}
+        found = tuple(n for names in super().targets(m) for n in names if n not in free)
+        return (found,) if found else ()
+
+
+class NominalInertia(NominalLinkValue):
+    """Inertia of links about their centre of mass within its tolerance."""
 
     name = "nominal_inertia"
     summary = "The inertia is the model's times a factor within the tolerance of nominal values; the mass stays."
@@ -88,7 +99,7 @@ class NominalInertia(NominalBodyValue):
     part_of = "inertia"
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return one factor a body."""
+        """Return one factor a link."""
         return nominal_parameters("inertia", self.target)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -100,7 +111,7 @@ class NominalInertia(NominalBodyValue):
         m.body_inertia[self.ids(m)] *= values[:, None]
 
 
-class NominalLength(NominalBodyValue):
+class NominalLength(NominalLinkValue):
     """Lengths of links within their tolerance."""
 
     name = "nominal_length"
@@ -110,13 +121,6 @@ class NominalLength(NominalBodyValue):
     )
     signature = "residuals in proportion to distances from the joint"
     confusions = ("length_scale", "mass")
-
-    @classmethod
-    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return the bodies that hang on others by joints."""
-        free = {element_name(m, mujoco.mjtObj.mjOBJ_BODY, b) for b in free_bodies(m)}
-        found = tuple(n for names in super().targets(m) for n in names if n not in free)
-        return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Let the compiled bodies have a centre of mass off their origin."""
