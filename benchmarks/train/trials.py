@@ -76,8 +76,8 @@ in 187 of 200 (`concent evaluate --checkpoint POLICY --world reality --episodes 
 Trainings of seeds 30 to 37 shared a GPU by twos.
 
 Two more tasks, a round peg and stacking, seeds 60 to 62, which were used for nothing before (`python -m
-benchmarks.train.cases --task round_peg --cases ours --seeds 60 61 62 --edges 400`, then `benchmarks.train.learning`
-with default settings, 2026-11-28): the six trainings shared two H200s by threes, beside other work, and ended with the
+benchmarks.train.cases --task round_peg --cases ours --seeds 60 61 62 --edges 400`, then `benchmarks.train.learning
+--seconds 800`, 2026-11-28): the six trainings shared two H200s by threes, beside other work, and ended with the
 machine. Of the peg 90 to 97 of 100 iterations were made. The policies of their only stress test, after 50, succeed in
 192, 190 and 175 of 200 trials, 93 % (`concent evaluate --checkpoint RUN --world reality --episodes 200 --seed 7`, AMD
 EPYC, 2 cores). Of stacking 38 to 41 iterations were made; 39 to 46 % succeed while exploring, and none was tried.

@@ -64,3 +64,11 @@ def test_it_is_not_named_alone_or_for_other_reasons(fitted):
     assert with_scattering(base, candidates, [refused, compliance], CFG.search) == [refused, compliance]
     other, chance = replace(drag, accepted=True, reason=""), replace(compliance, reason="no better than chance")
     assert with_scattering(base, candidates, [other, chance], CFG.search) == [other, chance]
+
+
+def test_it_is_not_named_where_another_one_explains_nearly_as_much(fitted):
+    base, (drag, compliance), (of_drag, of_compliance) = fitted
+    near = replace(drag, errors=1.001 * compliance.errors)
+    findings = [replace(of_drag, accepted=True, reason=""), of_compliance]
+    assert near.share(base) < compliance.share(base)
+    assert with_scattering(base, [near, compliance], findings, CFG.search) == findings
