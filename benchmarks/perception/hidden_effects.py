@@ -111,6 +111,8 @@ def sets(shift: int) -> list[DataSet]:
 
 def main(args: Args) -> None:
     """Track and diagnose what is not done yet, and write the page."""
+    if unknown := set(args.names) - {case.name for case in sets(args.shift)}:
+        raise SystemExit(f"--names: no data set {', '.join(sorted(unknown))} of --shift {args.shift}")
     kept = Measurements(args.data, seconds=args.seconds)
     for case in [] if args.table else sets(args.shift):
         if args.names and case.name not in args.names:

@@ -182,9 +182,12 @@ class SensorBias(MeasurementEffect):
         group = sensors_by_type(m, JOINTS[:1])
         return (group,) if group else ()
 
-    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return one constant for each sensor."""
-        return self.parameter_per_target("bias", "rad or m", 0.0, low=-0.5, high=0.5, scale=0.01)
+        return tuple(
+            Parameter(f"bias[{sensor}]", _unit_of_reading(m, sensor), 0.0, low=-0.5, high=0.5, scale=0.01)
+            for sensor in self.elements
+        )
 
     def true_state(
         self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray
@@ -253,6 +256,15 @@ def _shown_free_joints(m: mujoco.MjModel, sensors: Sequence[str], kind: int) -> 
     rows = [m.sensor(name).id for name in sensors]
     found = {shown_free_joint(m, row) for row in rows if int(m.sensor_type[row]) == kind}
     return sorted(j for j in found if j is not None)
+
+
+def _unit_of_reading(m: mujoco.MjModel, sensor: str) -> str:
+    """Return the unit of what a sensor reads, where it is a joint's position or velocity."""
+    i = m.sensor(sensor).id
+    if int(m.sensor_type[i]) not in JOINTS:
+        return "its unit"
+    position = "m" if int(m.jnt_type[m.sensor_objid[i]]) == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    return position if int(m.sensor_type[i]) == JOINTS[0] else f"{position}/s"
 
 
 def _shown_joints(m: mujoco.MjModel, sensors: Sequence[str], values: np.ndarray) -> Iterator[tuple[int, int, float]]:
