@@ -139,6 +139,8 @@ class Effect:
     """Engines that can express it."""
     nominal: ClassVar[bool] = False
     """Whether it stands for a nominal value of the model within its tolerance, which no diagnosis calls missing."""
+    singles_last: ClassVar[bool] = False
+    """Whether a diagnosis considers `single_targets` only where no other candidate explains the data."""
     history: ClassVar[float] = 0.0
     """Length [s] of the history of commands on which the present command depends."""
 

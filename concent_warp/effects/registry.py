@@ -59,6 +59,8 @@ NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalSize,
     nominal.NominalStiffness,
     nominal.NominalTendonStiffness,
+    nominal.NominalDamping,
+    nominal.NominalFriction,
     nominal.NominalGain,
     nominal.NominalVelocityGain,
     nominal.NominalLatency,

@@ -14,6 +14,10 @@ from concent_warp.scene.scene import Scene
 from tests.scenes.foreign import BALL, PUSHER
 from tests.scenes.swinging import NOISE, drawing, swung, windows_of
 
+FRICTION = (1.0, "-", 0.05)
+OTHER = {"nominal_latency": (0.0, "s", 5e-4), "nominal_damping": FRICTION, "nominal_friction": FRICTION}
+"""Null value, unit and tolerance of nominal values that are known otherwise than the others."""
+
 
 def test_masses_lengths_and_gains_are_scaled_and_nothing_else():
     model = Model(Scene(PUSHER))
@@ -31,6 +35,22 @@ def test_masses_lengths_and_gains_are_scaled_and_nothing_else():
     strong = model.add_effect("nominal_gain", ["elbow"], {"gain[elbow]": 1.02}).compile()
     np.testing.assert_allclose(strong.actuator_gainprm[:, 0], [12, 6.12])
     np.testing.assert_allclose(strong.actuator_biasprm[:, 2], [-0.6, -0.255])
+
+
+def test_friction_of_joints_that_have_any_is_scaled_about_all_their_axes():
+    rod = """<mujoco><worldbody><body name="rod"><joint name="socket" type="ball" damping="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.01"/><body name="slider">
+        <joint name="slide" type="slide" frictionloss="0.5"/><geom size="0.02"/></body></body></worldbody></mujoco>"""
+    model = Model(Scene(rod))
+    m = model.compile()
+    kinds = {kind.name: kind for kind in NOMINAL}
+    assert kinds["nominal_damping"].targets(m) == (("socket",),)
+    assert kinds["nominal_friction"].targets(m) == (("slide",),)
+    damped = model.add_effect("nominal_damping", ["socket"], {"damping[socket]": 1.1}).compile()
+    np.testing.assert_allclose(damped.dof_damping, [0.022, 0.022, 0.022, 0.0])
+    np.testing.assert_array_equal(damped.dof_frictionloss, m.dof_frictionloss)
+    rough = model.add_effect("nominal_friction", ["slide"], {"friction[slide]": 0.9}).compile()
+    np.testing.assert_allclose(rough.dof_frictionloss, [0.0, 0.0, 0.0, 0.45])
 
 
 def test_a_free_body_has_a_size_and_no_length():
@@ -55,7 +75,7 @@ def test_nominal_values_are_no_candidates_and_stay_within_two_tolerances(tmp_pat
         assert kind.nominal
         for target in kind.targets(model.compile()):
             for p in kind(*target).parameters(model.compile()):
-                null, unit, tolerance = (0.0, "s", 5e-4) if kind.name == "nominal_latency" else (1.0, "-", 0.01)
+                null, unit, tolerance = OTHER.get(kind.name, (1.0, "-", 0.01))
                 assert (p.null, p.unit) == (null, unit)
                 assert (p.low, p.high) == pytest.approx((null - 2 * tolerance, null + 2 * tolerance))
                 assert p.scale * LeastSquaresCfg().prior == pytest.approx(tolerance)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import mujoco
 import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_from_rivals
@@ -173,11 +174,12 @@ class AdditionFinder:
     def _candidates(self, base: FittedModel) -> tuple[list[Effect], list[Effect]]:
         """Return the effects that a fitted model may lack, and those considered only where none of these explains it.
 
-        The latter are parts of elements; those of an effect that was asked for by its name are among the former.
+        The latter are parts of elements, and single ones of some effects (`Effect.singles_last`); those of an effect
+        that was asked for by its name are among the former.
         """
-        asked = self.context.cfg.effects
+        asked, m = self.context.cfg.effects, base.model.compile()
         found = candidates(base.model, self.channels, asked)
-        later = [e for e in found if e.is_part and e.name not in asked]
+        later = [e for e in found if e.name not in asked and (e.is_part or is_single_of_many(e, m))]
         return [e for e in found if e not in later], later
 
     def _leaves_more(self, base: FittedModel, fitted: Sequence[FittedCandidate]) -> bool:
@@ -279,6 +281,11 @@ class AdditionFinder:
         names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
         context.progress(ranking(base, screened, names, cfg.seed))
         return self.gradient.apply(base, screened, context.runner) if self.gradient else screened
+
+
+def is_single_of_many(effect: Effect, m: mujoco.MjModel) -> bool:
+    """Return whether an effect acts on one of several elements, and is considered after those on all of them."""
+    return effect.singles_last and effect.target in effect.single_targets(m)
 
 
 def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:

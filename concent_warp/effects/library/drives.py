@@ -254,7 +254,13 @@ class ActuatorDelay(DriveEffect):
     requirement = WITH_THRUSTERS
     of_thrusters = True
     step_error = PHASE_ERROR
+    singles_last = True
     history = 0.3
+
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each of several drives: one alone may be reached by another bus, or a gateway."""
+        return each_of_several(cls.targets(m))
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one delay for all."""

@@ -59,6 +59,19 @@ class Latency(MeasurementEffect):
     signature = "residuals in proportion to velocity, at the same delay in all phases"
     confusions = ("actuator_delay", "time_base")
     step_error = PHASE_ERROR
+    singles_last = True
+
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return what each of several instruments reads: the sensors of one joint, or of one place."""
+        found: list[tuple[str, ...]] = []
+        for group in cls.targets(m):
+            by_place: dict[tuple[int, int], list[str]] = {}
+            for name in group:
+                i = m.sensor(name).id
+                by_place.setdefault((int(m.sensor_objtype[i]), int(m.sensor_objid[i])), []).append(name)
+            found += map(tuple, by_place.values()) if len(by_place) > 1 else ()
+        return tuple(found)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one delay."""

@@ -1,4 +1,4 @@
-"""Nominal values of a model within their tolerance: masses, lengths, gains and the clocks of instruments.
+"""Nominal values of a model within their tolerance: masses, lengths, gains, friction and the clocks of instruments.
 
 They are no effects that a model lacks: data sheets, rulers and time stamps are no better. A diagnosis fits them before
 it looks for an effect, each with a normal prior about the nominal value, so that small errors of several are not taken
@@ -7,30 +7,35 @@ for one.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.library.drives import KV, ActuatorGain
-from concent_warp.effects.library.joints import JointEffect
+from concent_warp.effects.library.joints import BearingEffect, JointEffect
 from concent_warp.effects.library.measurement import MeasurementEffect
 from concent_warp.effects.library.objects import Size, mass_fields
-from concent_warp.effects.select import element_name, free_bodies
+from concent_warp.effects.select import dofs_of, element_name, free_bodies
 
 TOLERANCE = 0.01
 """Standard deviation of a nominal value over the value [-]: what scales, rulers and data sheets state as a rule."""
 CLOCK_TOLERANCE = 5e-4
 """Standard deviation of a channel's latency [s]: stamps are given when a bus is polled, at 1 kHz as a rule (a frame of
 USB 2.0 takes 1 ms)."""
+FRICTION_TOLERANCE = 0.05
+"""Standard deviation of the friction and damping of joints over the model's [-]: several per cent between repeated
+measurements of one machine (`FRICTION_SCATTER`), and as much between machines of one make."""
 BOUND = 2.0
 """Bounds, in standard deviations: 95 % of a normal distribution."""
 PRIOR_SCALES = 10.0
 """Standard deviations of a parameter's prior over its scale (`LeastSquaresCfg.prior`)."""
 
 
-def nominal_parameters(name: str, targets: tuple[str, ...]) -> tuple[Parameter, ...]:
+def nominal_parameters(name: str, targets: tuple[str, ...], tolerance: float = TOLERANCE) -> tuple[Parameter, ...]:
     """Return one factor a target, 1 by default, within the tolerance."""
-    low, high, scale = 1 - BOUND * TOLERANCE, 1 + BOUND * TOLERANCE, TOLERANCE / PRIOR_SCALES
+    low, high, scale = 1 - BOUND * tolerance, 1 + BOUND * tolerance, tolerance / PRIOR_SCALES
     return tuple(Parameter(f"{name}[{t}]", "-", 1.0, low, high, scale) for t in targets)
 
 
@@ -188,6 +193,58 @@ class NominalStiffness(JointEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Scale it."""
         m.jnt_stiffness[self.ids(m)] *= values
+
+
+class NominalBearingValue(BearingEffect):
+    """A nominal value of the bearings of joints that a model has."""
+
+    nominal = True
+    source = "tolerance of nominal values"
+    field: ClassVar[str]
+    """Field of the compiled model with a value a degree of freedom."""
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the joints that have any of it."""
+        found = tuple(
+            n for names in super().targets(m) for n in names if getattr(m, cls.field)[m.joint(n).dofadr].any()
+        )
+        return (found,) if found else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor a joint."""
+        return nominal_parameters(self.part_of.removeprefix("joint_"), self.target, FRICTION_TOLERANCE)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """See `field`."""
+        return (self.field,)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale it."""
+        dofs, rows = dofs_of(m, self.ids(m))
+        getattr(m, self.field)[dofs] *= values[rows]
+
+
+class NominalDamping(NominalBearingValue):
+    """Viscous friction that a model has in its joints, within its tolerance."""
+
+    name = "nominal_damping"
+    summary = "The damping of the joint is the model's times a factor within the tolerance of friction."
+    signature = "residual torque in proportion to velocity"
+    confusions = ("joint_damping",)
+    part_of = "joint_damping"
+    field = "dof_damping"
+
+
+class NominalFriction(NominalBearingValue):
+    """Dry friction that a model has in its joints, within its tolerance."""
+
+    name = "nominal_friction"
+    summary = "The friction loss of the joint is the model's times a factor within the tolerance of friction."
+    signature = "residual torque against the motion, whatever its speed"
+    confusions = ("joint_friction", "stribeck_friction", "load_friction")
+    part_of = "joint_friction"
+    field = "dof_frictionloss"
 
 
 class NominalTendonStiffness(Effect):

@@ -1,0 +1,27 @@
+"""Effects on single elements of a selection, which a diagnosis tries after those on all of them."""
+
+from concent_warp.diagnosis.search.find_addition import is_single_of_many
+from concent_warp.effects.registry import effect_class
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from tests.scenes.foreign import BALL, PUSHER
+
+SPEEDS = PUSHER.replace("</sensor>", '<jointvel name="elbow_speed" joint="elbow"/></sensor>')
+
+
+def test_what_one_of_several_instruments_reads_may_be_late():
+    m = Model(Scene(SPEEDS)).compile()
+    latency = effect_class("latency")
+    assert latency.single_targets(m) == (("shoulder_position",), ("elbow_position", "elbow_speed"))
+    assert latency.single_targets(Model(Scene(BALL)).compile()) == ()
+    assert is_single_of_many(latency("elbow_position", "elbow_speed"), m)
+    assert not is_single_of_many(latency("shoulder_position", "elbow_position", "elbow_speed"), m)
+
+
+def test_one_of_several_drives_may_be_late():
+    m = Model(Scene(PUSHER)).compile()
+    delay = effect_class("actuator_delay")
+    assert delay.single_targets(m) == (("shoulder",), ("elbow",))
+    assert is_single_of_many(delay("elbow"), m)
+    assert not is_single_of_many(delay("shoulder", "elbow"), m)
+    assert not is_single_of_many(effect_class("backlash")("elbow"), m)
