@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-import mujoco
 import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_from_rivals
@@ -114,6 +113,7 @@ class AdditionFinder:
         least = self._least_promise(base)
         fits = CandidateFits(base, cfg, context.runner)
         fitted = fits.fit(screened, needed, short_windows, least)
+        parts = [e for e in parts if e.is_part or promises(e, screened, needed)]
         if parts and context.record.provisional is None and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
@@ -177,9 +177,9 @@ class AdditionFinder:
         The latter are parts of elements, and single ones of some effects (`Effect.singles_last`); those of an effect
         that was asked for by its name are among the former.
         """
-        asked, m = self.context.cfg.effects, base.model.compile()
+        asked = self.context.cfg.effects
         found = candidates(base.model, self.channels, asked)
-        later = [e for e in found if e.name not in asked and (e.is_part or is_single_of_many(e, m))]
+        later = [e for e in found if e.name not in asked and (e.is_part or is_single_of_many(e, found))]
         return [e for e in found if e not in later], later
 
     def _leaves_more(self, base: FittedModel, fitted: Sequence[FittedCandidate]) -> bool:
@@ -283,9 +283,20 @@ class AdditionFinder:
         return self.gradient.apply(base, screened, context.runner) if self.gradient else screened
 
 
-def is_single_of_many(effect: Effect, m: mujoco.MjModel) -> bool:
-    """Return whether an effect acts on one of several elements, and is considered after those on all of them."""
-    return effect.singles_last and effect.target in effect.single_targets(m)
+def is_single_of_many(effect: Effect, among: Sequence[Effect]) -> bool:
+    """Return whether an effect acts on one of several elements, and is considered after that on all of them."""
+    return effect.singles_last and any(e.name == effect.name and set(effect.target) < set(e.target) for e in among)
+
+
+def promises(single: Effect, screened: Sequence[ScreenedCandidate], needed: float) -> bool:
+    """Return whether the same effect on all elements is expected to gain what is needed: part of what one of them does.
+
+    Args:
+        single: The effect on one of several elements.
+        screened: The candidates on all of them.
+        needed: Share of the held-out error that an effect must remove [-].
+    """
+    return any(s.effect.name == single.name and s.expected_gain >= needed for s in screened)
 
 
 def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:

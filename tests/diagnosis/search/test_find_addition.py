@@ -32,7 +32,7 @@ class MadeUp(SimpleNamespace):
 
 def candidate(name: str, *, is_part: bool = False) -> Any:
     """Return a candidate, or a part of an element."""
-    return SimpleNamespace(name=name, is_part=is_part, target=(), elements=())
+    return SimpleNamespace(name=name, is_part=is_part, singles_last=False, target=(), elements=())
 
 
 def searched(
