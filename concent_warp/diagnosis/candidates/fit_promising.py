@@ -210,12 +210,10 @@ class CandidateFits:
         minimum, promises are all too small, and are compared with that of the best.
 
         Args:
-            fitted: The candidates of the last fits, as they were screened.
+            fitted: The candidates of the last fits, as they were screened; none where there was no time for any.
         """
-        share, promise = max(
-            (c.share(self.base), s.expected_gain)
-            for c, s in zip(self.fits[len(self.fits) - len(fitted) :], fitted, strict=True)
-        )
+        last = zip(self.fits[len(self.fits) - len(fitted) :], fitted, strict=True)
+        share, promise = max(((c.share(self.base), s.expected_gain) for c, s in last), default=(0.0, 0.0))
         best = self._best().share(self.base)
         return promise if share == best and promise < self.search.stuck_share * share else best
 

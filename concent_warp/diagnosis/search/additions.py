@@ -133,7 +133,10 @@ class Additions:
             if best is None:
                 record.form_corrected = self._is_corrected(fitted[-1], correction)
                 break
-            fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
+            added = add_candidate(fitted[-1], best)
+            renew = partial(renew_defects, added, cfg.time_step)
+            unsettled = "Not computed again beside the last effect: what a shorter time step changes."
+            fitted.append(context.budget.attempt(renew, added, unsettled))
         return fitted, detectable
 
     def _is_within_tolerances(self, one: FittedModel, first: FittedModel) -> bool:
