@@ -136,6 +136,8 @@ class _State:
     starts: tuple[np.ndarray, ...]
     refits: int
     """Refits of the initial states that are left."""
+    limit: float = np.inf
+    """Limit of Huber's loss beyond which that of no point rises [-]; infinite while the cost falls without."""
 
 
 class Solver:
@@ -476,6 +478,10 @@ class Solver:
     ) -> Fit:
         """Fit from a start.
 
+        The limit of Huber's loss follows the spread of the residuals. Where many residuals are small and some far off,
+        a step that betters the latter for little in the others raises the limit, and the cost with it. Where no step
+        lowers the cost otherwise, the limit therefore rises no more.
+
         Args:
             values: Parameters at the start, shape (P,); by default as the model has them, or their null values.
             offsets: Errors of the initial states in units of their spread.
@@ -494,11 +500,11 @@ class Solver:
         damping, converged = self.cfg.damping, False
         refits = self.cfg.refits if refits is None else refits
         linear = self.linearise(values, offsets)
-        cost = self.cost([window.residual for window in linear], offsets, values)
+        cost, limit = self.cost([window.residual for window in linear], offsets, values), np.inf
         for iteration in range(self.cfg.iterations):
-            state = _State(values, list(offsets), cost, starts, refits)
+            state = _State(values, list(offsets), cost, starts, refits, limit)
             found, damping = self._advance(state, linear, damping)
-            refits = found.refits
+            refits, limit = found.refits, found.limit
             gain = (cost - found.cost) / max(cost, 1e-12)
             if found.cost < cost:
                 values, offsets, cost, starts = found.values, found.offsets, found.cost, found.starts
@@ -508,39 +514,53 @@ class Solver:
             if gain < self.cfg.tolerance:
                 converged = True
                 break
+        cost = self.cost([window.residual for window in linear], offsets, values)
         return Fit(values, tuple(offsets), cost, linear, starts, converged, self.p.simulated)
+
+    def _limit(self, linear: Sequence[Linear]) -> float:
+        """Return the limit of Huber's loss that goes with the spread of some residuals."""
+        return huber_limit([window.residual for window in linear], self.cfg.robust)
 
     def _advance(self, state: _State, linear: Sequence[Linear], damping: float) -> tuple[_State, float]:
         """Return a better point, or the same one where there is none, and the next damping.
 
         A step uses the derivatives by the initial states as computed last. Where the cost falls by less than
         `predicted_share` of the prediction, the initial states are fitted anew at the new parameters before the step is
-        judged.
+        judged. Where no step lowers the cost by more than `tolerance`, the first one counts that does with the limit of
+        Huber's loss at this point.
         """
-        cfg = self.cfg
+        cfg, held = self.cfg, None
         for _ in range(cfg.max_damping_trials):
-            move, moves = self.solve(linear, state.starts, state.offsets, state.values, damping)
+            move, moves = self.solve(linear, state.starts, state.offsets, state.values, damping, state.limit)
             values = self.inside(state.values + move * self.scale)
             offsets = [o + m for o, m in zip(state.offsets, moves, strict=True)]
             expected = [
                 window.residual + window.jacobian @ move + a @ m
                 for window, a, m in zip(linear, state.starts, moves, strict=True)
             ]
-            predicted = state.cost - self.cost(expected, offsets, values)
-            cost = self.cost(self.p.residuals(self.trials(values, offsets)), offsets, values)
+            predicted = state.cost - self.cost(expected, offsets, values, state.limit)
+            residuals = self.p.residuals(self.trials(values, offsets))
+            cost = self.cost(residuals, offsets, values, state.limit)
             as_predicted = state.cost - cost > cfg.predicted_share * max(predicted, 0.0)
+            if held is not None and 0 <= state.cost - cost < cfg.tolerance * state.cost:
+                return held
             if cost < state.cost and (as_predicted or not state.refits):
                 lowered = max(damping / cfg.damping_decrease, cfg.min_damping)
-                return _State(values, offsets, cost, state.starts, state.refits), lowered
+                return replace(state, values=values, offsets=offsets, cost=cost), lowered
             if state.refits:
                 begin = state.offsets if cost > cfg.restart_ratio * state.cost else offsets
                 refitted, starts = self.fit_initial_states(values, begin, cfg.refit_iterations, state.starts)
-                again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values)
+                again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values, state.limit)
                 state = replace(state, refits=state.refits - 1)
                 if again < state.cost:
-                    return _State(values, refitted, again, starts, state.refits), damping
+                    return replace(state, values=values, offsets=refitted, cost=again, starts=starts), damping
+            if held is None and np.isinf(state.limit):
+                limit = self._limit(linear)
+                least = self.cost(residuals, offsets, values, limit)
+                if least < (1 - cfg.tolerance) * state.cost:
+                    held = _State(values, offsets, least, state.starts, state.refits, limit), damping
             damping = max(damping * cfg.damping_increase, cfg.min_raised_damping)
-        return state, damping
+        return held or (state, damping)
 
     def inside(self, values: np.ndarray) -> np.ndarray:
         """Return values within their bounds; infinite ones stay."""
@@ -552,9 +572,22 @@ class Solver:
         finite = np.isfinite(values)
         return np.where(finite, (values - mean) / (self.cfg.prior * self.scale), 0.0)
 
-    def cost(self, residuals: Sequence[np.ndarray], offsets: Sequence[np.ndarray], values: np.ndarray) -> float:
-        """Return half the robust sum of squares, with the priors."""
-        limit = huber_limit(residuals, self.cfg.robust)
+    def cost(
+        self,
+        residuals: Sequence[np.ndarray],
+        offsets: Sequence[np.ndarray],
+        values: np.ndarray,
+        most: float = np.inf,
+    ) -> float:
+        """Return half the robust sum of squares, with the priors.
+
+        Args:
+            residuals: Residuals by window in units of noise, each (n,).
+            offsets: Errors of the initial states in units of their spread, one (2 nv,) a window.
+            values: Parameters, shape (P,).
+            most: Largest limit of Huber's loss [-].
+        """
+        limit = min(huber_limit(residuals, self.cfg.robust), most)
         total = sum(float(huber(r, limit).sum()) for r in residuals)
         total += sum(cauchy_cost(o, self.cfg.robust) for o in offsets)
         prior = self.prior(values)
@@ -567,10 +600,20 @@ class Solver:
         offsets: Sequence[np.ndarray],
         values: np.ndarray,
         damping: float,
+        most: float = np.inf,
     ) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the damped step of the parameters, in units of their scale, and of each initial state."""
+        """Return the damped step of the parameters, in units of their scale, and of each initial state.
+
+        Args:
+            linear: Residuals and sensitivities by window.
+            starts: See `Fit.starts`.
+            offsets: Errors of the initial states in units of their spread, one (2 nv,) a window.
+            values: Parameters, shape (P,).
+            damping: Levenberg-Marquardt damping, relative to the curvature [-].
+            most: Largest limit of Huber's loss [-].
+        """
         size = len(self.scale)
-        limit = huber_limit([window.residual for window in linear], self.cfg.robust)
+        limit = min(self._limit(linear), most)
         normal, slope = np.eye(size) / self.cfg.prior**2, self.prior(values) / self.cfg.prior
         parts = []
         for window, a, o in zip(linear, starts, offsets, strict=True):

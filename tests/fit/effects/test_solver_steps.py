@@ -219,8 +219,8 @@ def stepper(f: Any, **options: Any) -> tuple[Solver, _State, list[float]]:
     solver = solver_of(1, start=(0.0,), low=(-10.0,), high=(10.0,), **options)
     dampings: list[float] = []
 
-    def solve(linear: Any, starts: Any, offsets: Any, values: np.ndarray, damping: float) -> Any:
-        del linear, starts, offsets, values
+    def solve(linear: Any, starts: Any, offsets: Any, values: np.ndarray, damping: float, most: float) -> Any:
+        del linear, starts, offsets, values, most
         dampings.append(damping)
         return np.array([5.0 / len(dampings)]), [np.zeros(2)]  # steps 1, 1/2, 1/3, ...
 
