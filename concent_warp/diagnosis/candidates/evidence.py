@@ -109,6 +109,33 @@ def with_scattering(
     return found
 
 
+def without_implausible(
+    base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding], cfg: DiagnoseCfg
+) -> list[Finding]:
+    """Return findings, accepted ones of sizes far beyond typical ones refused where one of a plausible size is enough.
+
+    That one leaves no more besides than an error in its formula may be: as `DiagnoseCfg.max_typical_sizes` says of a
+    remainder, such an error is the more plausible cause.
+
+    Args:
+        base: The fitted baseline.
+        fitted: The candidates.
+        findings: Their evidence, in the same order.
+        cfg: Settings.
+    """
+    accepted = [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
+    implausible = [c for c in accepted if largest_size(base, c) > cfg.max_typical_sizes]
+    plausible = [c for c in accepted if not any(c is other for other in implausible)]
+    enough = max((c.share(base) for c in plausible), default=-np.inf) + cfg.unknown_force.min_share
+    reason = "explains no more than errors in formulas beside another one, by a size far beyond typical ones"
+    return [
+        replace(f, accepted=False, reason=reason)
+        if any(c is other for other in implausible) and c.share(base) <= enough
+        else f
+        for c, f in zip(fitted, findings, strict=True)
+    ]
+
+
 def fitted_parameters(
     base: FittedModel, c: FittedCandidate, *, null_known: bool = False
 ) -> tuple[FittedParameter, ...]:

@@ -22,6 +22,7 @@ from concent_warp.diagnosis.candidates.evidence import (
     leaves_more,
     profile_widening,
     with_scattering,
+    without_implausible,
 )
 from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
 from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
@@ -139,6 +140,7 @@ class AdditionFinder:
         if context.record.part_refused:
             reason = "removes a part of what may be errors in formulas"
             findings = [replace(f, accepted=False, reason=f.reason or reason) for f in findings]
+        findings = without_implausible(base, fitted, findings, cfg)
         accepted = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not accepted:
             context.record.findings += sorted(findings, key=lambda f: -f.gain)

@@ -119,6 +119,12 @@ class AirDrag(AirEffect):
         m.opt.density = max(float(values[0]), 0.0)
 
 
+WIND, VERTICAL_WIND = 3.0, 0.3
+"""Typical wind along each horizontal axis and upward [m/s]. Near the ground no wind crosses it: what is left upward is
+turbulence, 1.25 x the friction velocity, a tenth of the wind a metre above a floor (Stull, "An Introduction to Boundary
+Layer Meteorology", 1988)."""
+
+
 class Wind(AirEffect):
     """Air that moves."""
 
@@ -133,8 +139,8 @@ class Wind(AirEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Velocity of the wind along each axis of the world."""
-        scan = (-5.0, 5.0)
-        return tuple(Parameter(axis, "m/s", 0.0, -30.0, 30.0, 3.0, scan=scan) for axis in "xyz")
+        typical = (("x", WIND), ("y", WIND), ("z", VERTICAL_WIND))
+        return tuple(Parameter(axis, "m/s", 0.0, -30.0, 30.0, size, scan=(-5.0, 5.0)) for axis, size in typical)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Wind and density of the medium."""

@@ -37,7 +37,7 @@ def candidate(name: str, *, is_part: bool = False) -> Any:
 
 def searched(
     monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0, step=1, base=None,
-    refitted=0.05, **given
+    refitted=0.05, implausible=(), **given
 ):  # fmt: skip
     """Return what a search adds whose candidates have these gains, and notes of what is asked for."""
     notes: dict[str, Any] = {"bases": []}
@@ -73,16 +73,26 @@ def searched(
             notes["asked"] = needed
             return fitted
 
+    def plausible(_base, _fitted, findings, _cfg):
+        return [replace(f, accepted=f.accepted and f.name not in implausible) for f in findings]
+
     def refit(base, rivals):
         notes["rivals"] = [c.name for c in rivals]
         return SimpleNamespace(**{**vars(base), "less": refitted})
 
     monkeypatch.setattr(find_addition, "assess", assess)
     monkeypatch.setattr(find_addition, "CandidateFits", Fits)
+    monkeypatch.setattr(find_addition, "without_implausible", plausible)
     monkeypatch.setattr(find_addition, "refit_from_rivals", refit)
     monkeypatch.setattr(find_addition, "profile_widening", lambda _base, c: f"width of {c.name}")
     monkeypatch.setattr(find_addition, "group_indistinguishable", lambda _base, accepted, *_: accepted[:2])
     return made.additions.finder.find(base or node(ratio), step, **given), notes
+
+
+def test_an_effect_of_an_implausible_size_is_not_added(monkeypatch):
+    gains = {"a": (0.7, True), "b": (0.6, True)}
+    (best, _), _ = searched(monkeypatch, procedure(), gains, np.zeros(1), implausible=("a",))
+    assert best.name == "b"
 
 
 def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
@@ -331,6 +341,7 @@ class Parts:
         monkeypatch.setattr(find_addition, "detectable_size", lambda _b, s, needed: f"{s} {needed}")
         monkeypatch.setattr(find_addition, "CandidateFits", Fits)
         monkeypatch.setattr(find_addition, "assess", assess)
+        monkeypatch.setattr(find_addition, "without_implausible", lambda _b, _c, findings, _cfg: findings)
         monkeypatch.setattr(find_addition, "profile_widening", lambda _base, c: f"width of {c.name}")
         monkeypatch.setattr(
             find_addition,
