@@ -25,7 +25,7 @@ from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.replayed import Replayed, replayed
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.adequacy import discrepancies, hidden_by_noise, is_lacking, least_ratio
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio, qualified_by_noise
 from concent_warp.diagnosis.search.alternatives import try_alternatives
 from concent_warp.diagnosis.search.consistency import beyond_effects
 from concent_warp.diagnosis.search.context import (
@@ -115,10 +115,7 @@ class Procedure:
         runner.enter(ADDITIONS_DONE, REVISION_DONE)
         fitted = revision.restore_given(revision.simplified(fitted), given)
         fitted = revision.final_values(revision.profiled(fitted))
-        found = self.conclude(given, fitted, detectable, issues)
-        hidden = hidden_by_noise(fitted[-1], noises, cfg)
-        if hidden is not None and found.verdict in ("none_needed", "effect", "group"):
-            found = replace(found, issues=(*found.issues, hidden))
+        found = qualified_by_noise(self.conclude(given, fitted, detectable, issues), fitted[-1], noises, cfg)
         runner.progress(1.0, "done")
         return found
 

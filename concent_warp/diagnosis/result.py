@@ -33,6 +33,7 @@ VERDICTS: dict[Verdict, str] = {
 }
 """Verdicts in words."""
 STEP_TOO_LONG = "the time step of the model is too long for a verdict"
+NOISE_OPEN = "the noise is too uncertain for a verdict"
 """The same of "unsettled" where no time was short."""
 
 
@@ -280,8 +281,8 @@ class Diagnosis:
     """Whether the search for further effects beside the accepted ones came to its end; False where the time ended it,
     so that something smaller may be missing too; None where the verdict is another one than "effect" or "group"."""
     replayed: Replayed | None = None
-    """What a replay in one piece says of `model`; None where the verdict is another one than "effect" or "group", or
-    it was not done."""
+    """What a replay in one piece says of `model`; None where it was not done, or the verdict is another one than
+    "effect" or "group", or than "unsettled" for the sake of this replay and a noise that is too uncertain."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
     holding: tuple[HoldingFriction, ...] = ()
@@ -317,6 +318,8 @@ class Diagnosis:
         """The verdict in words; where effects were accepted and a discrepancy is left, it says both."""
         if self.verdict == "none_of_these" and self.accepted:
             return "the library explains a part; something is missing that none of its effects explains"
+        if self.replayed is not None and self.verdict == "unsettled":
+            return NOISE_OPEN
         if self.replayed is not None and self.replayed.doubtful:
             return f"{VERDICTS[self.verdict]}, over short windows"
         if self.verdict == "unsettled" and self.time_step is not None and self.time_step.too_long:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.estimation.noise import Noise
 from concent_warp.fit.effects.robust import huber, robust_noise_ratio
 
@@ -62,6 +64,25 @@ def hidden_by_noise(base: FittedModel, noises: Mapping[str, Noise], cfg: Diagnos
         f"With the least noise that these readings allow, residuals are {largest:.2g} x noise: what is missing may be "
         "hidden by the estimate. State the noise, of encoders their resolution / sqrt(12), and diagnose again."
     )
+
+
+def qualified_by_noise(found: Diagnosis, base: FittedModel, noises: Mapping[str, Noise], cfg: DiagnoseCfg) -> Diagnosis:
+    """Return a diagnosis that says where what is missing may be hidden by the noise, see `hidden_by_noise`.
+
+    Where a replay in one piece is far off as well, no effect is named: neither windows nor replay speak for one.
+
+    Args:
+        found: The diagnosis.
+        base: The last fitted model.
+        noises: Noise of each channel that is not stated.
+        cfg: Settings.
+    """
+    hidden = hidden_by_noise(base, noises, cfg)
+    if hidden is None or found.verdict not in ("none_needed", "effect", "group"):
+        return found
+    doubtful = found.replayed is not None and found.replayed.doubtful
+    verdict = "unsettled" if doubtful else found.verdict
+    return replace(found, issues=(*found.issues, hidden), verdict=verdict)
 
 
 def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: DiagnoseCfg) -> bool:
