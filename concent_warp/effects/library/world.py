@@ -121,8 +121,8 @@ class AirDrag(AirEffect):
 
 WIND, VERTICAL_WIND = 3.0, 0.3
 """Typical wind along each horizontal axis and upward [m/s]. Near the ground no wind crosses it: what is left upward is
-turbulence, 1.25 x the friction velocity, a tenth of the wind a metre above a floor (Stull, "An Introduction to Boundary
-Layer Meteorology", 1988)."""
+turbulence, 1.25 x the friction velocity, a tenth of the wind a metre above a floor (Panofsky and Dutton, "Atmospheric
+Turbulence", 1984, chapter 7)."""
 
 
 class Wind(AirEffect):
