@@ -1,11 +1,6 @@
 """Effects on single elements of a selection, which a diagnosis tries after those on all of them."""
 
-from types import SimpleNamespace
-from typing import Any
-
-import pytest
-
-from concent_warp.diagnosis.search.find_addition import is_single_of_many, promises
+from concent_warp.diagnosis.search.find_addition import is_single_of_many
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -34,13 +29,3 @@ def test_one_of_several_drives_may_be_late():
     assert not is_single_of_many(both, [both, elbow])
     backlash = effect_class("backlash")
     assert not is_single_of_many(backlash("elbow"), [backlash("shoulder", "elbow"), backlash("elbow")])
-
-
-@pytest.mark.parametrize(("gain", "other", "promised"), [(0.2, 0.0, True), (0.05, 0.5, False)])
-def test_one_alone_is_tried_where_the_effect_on_all_gains_enough(gain, other, promised):
-    delay, latency = effect_class("actuator_delay"), effect_class("latency")
-    screened: list[Any] = [
-        SimpleNamespace(effect=delay("shoulder", "elbow"), expected_gain=gain),
-        SimpleNamespace(effect=latency("shoulder_position", "elbow_position"), expected_gain=other),
-    ]
-    assert promises(delay("elbow"), screened, 0.1) is promised

@@ -114,7 +114,6 @@ class AdditionFinder:
         least = self._least_promise(base)
         fits = CandidateFits(base, cfg, context.runner)
         fitted = fits.fit(screened, needed, short_windows, least)
-        parts = [e for e in parts if e.is_part or promises(e, screened, needed)]
         if parts and context.record.provisional is None and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
@@ -288,17 +287,6 @@ class AdditionFinder:
 def is_single_of_many(effect: Effect, among: Sequence[Effect]) -> bool:
     """Return whether an effect acts on one of several elements, and is considered after that on all of them."""
     return effect.singles_last and any(e.name == effect.name and set(effect.target) < set(e.target) for e in among)
-
-
-def promises(single: Effect, screened: Sequence[ScreenedCandidate], needed: float) -> bool:
-    """Return whether the same effect on all elements is expected to gain what is needed: part of what one of them does.
-
-    Args:
-        single: The effect on one of several elements.
-        screened: The candidates on all of them.
-        needed: Share of the held-out error that an effect must remove [-].
-    """
-    return any(s.effect.name == single.name and s.expected_gain >= needed for s in screened)
 
 
 def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:
