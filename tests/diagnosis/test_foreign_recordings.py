@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import concent_warp as cw
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.recording import Recording
-from tests.scenes.foreign import BALL, pusher, swing_up, thrown_ball, write_csv
+from tests.scenes.foreign import BALL, PUSHER, pusher, swing_up, thrown_ball, write_csv
 
 RIVALS_OF_DRAG = ("air_drag", "wind", "gravity_tilt", "time_base", "length_scale", "latency", "contact_compliance")
 """Effects that a thrown ball could lack."""
@@ -78,6 +79,23 @@ def test_nothing_is_missing_from_an_arm_but_a_shorter_time_step(tmp_path):
     assert found.model.scene.model.opt.timestep == found.time_step.used
     assert any("time step of 2 ms is too long" in sentence for sentence in found.sentences())
     assert found.to_json()["time_step"]["gain"]["value"] > 0.5
+
+
+def test_damping_that_is_off_by_no_more_than_friction_varies_is_not_missing(tmp_path):
+    recording = read_csv(write_csv(pusher(damping=0.15, delay=0.0, noise=2e-4), tmp_path / "arm"))
+    recording = replace(recording, scene=PUSHER.replace('damping="0.05"', 'damping="0.14"'))
+    found = diagnosed(recording, effects=("joint_damping", "joint_friction", "actuator_gain", "actuator_delay"))
+    assert found.verdict == "none_needed"
+    assert not found.accepted
+    assert {p.name: p.value for p in found.nominal_values}["damping[elbow]"] > 1.02
+
+
+def test_one_encoder_that_is_late_is_named(tmp_path):
+    recording = read_csv(write_csv(pusher(damping=0.05, delay=0.0, late=0.02), tmp_path / "arm"))
+    found = diagnosed(recording, effects=("latency", "actuator_delay", "joint_damping", "sensor_gain"))
+    assert found.verdict == "effect"
+    assert [(f.name, f.target) for f in found.accepted] == [("latency(elbow_position)", ("elbow_position",))]
+    assert values(found)["delay"] == pytest.approx(0.02, rel=0.05)
 
 
 def test_nothing_is_missing_from_a_swung_up_pendulum_but_a_shorter_time_step(tmp_path):

@@ -97,7 +97,9 @@ def _integrated(
     return np.concatenate(found, axis=1).T
 
 
-def pusher(damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, seconds: float = 6.0) -> Recording:
+def pusher(
+    damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, seconds: float = 6.0, late: float = 0.0
+) -> Recording:
     """Return the log of a two-joint arm in the plane; its model has damping 0.05 N m s/rad and no delay.
 
     The motion is a sum of sines; the arm never rests.
@@ -107,6 +109,7 @@ def pusher(damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, s
         delay: Time from a command to its effect [s].
         noise: Standard deviation of the angles [rad].
         seconds: Length.
+        late: Latency of the elbow's encoder alone [s].
     """
     rng = np.random.default_rng(5)
     period = 0.01
@@ -138,8 +141,11 @@ def pusher(damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, s
         coriolis = np.array([-bend * (2 * v[0] * v[1] + v[1] ** 2), bend * v[0] ** 2])
         return np.concatenate([v, np.linalg.solve(mass, torque - coriolis)])
 
-    time = np.arange(0.0, seconds - 0.02, 0.008)
-    angles = _integrated(rates, [0.0] * 4, time, period, delay)[:, :2] + rng.normal(0, noise, (len(time), 2))
+    time = np.arange(late, seconds - 0.02, 0.008)
+    shoulder, elbow = (
+        _integrated(rates, [0.0] * 4, time - age, period, delay)[:, j] for j, age in ((0, 0.0), (1, late))
+    )
+    angles = np.stack([shoulder, elbow], axis=1) + rng.normal(0, noise, (len(time), 2))
     demonstration = Demonstration(
         "demo_0",
         qpos=np.zeros(2),
