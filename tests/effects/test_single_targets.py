@@ -1,6 +1,6 @@
 """Effects on single elements of a selection, which a diagnosis tries after those on all of them."""
 
-from concent_warp.diagnosis.search.find_addition import is_single_of_many
+from concent_warp.diagnosis.candidates.candidates import is_single_of_many, label
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -27,5 +27,6 @@ def test_one_of_several_drives_may_be_late():
     both, elbow = delay("shoulder", "elbow"), delay("elbow")
     assert is_single_of_many(elbow, [both, elbow])
     assert not is_single_of_many(both, [both, elbow])
+    assert [label(e, [both, elbow]) for e in (both, elbow)] == ["actuator_delay", "actuator_delay(elbow)"]
     backlash = effect_class("backlash")
     assert not is_single_of_many(backlash("elbow"), [backlash("shoulder", "elbow"), backlash("elbow")])

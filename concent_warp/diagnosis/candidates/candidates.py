@@ -43,9 +43,17 @@ def has_effect(model: Model, effect: Effect) -> bool:
     )
 
 
+def is_single_of_many(effect: Effect, among: Sequence[Effect]) -> bool:
+    """Return whether an effect acts on one of several elements, and is considered after that on all of them."""
+    return effect.singles_last and any(e.name == effect.name and set(effect.target) < set(e.target) for e in among)
+
+
 def label(effect: Effect, among: Sequence[Effect]) -> str:
-    """Return the effect's name, with its target where several candidates share the name."""
-    if sum(e.name == effect.name for e in among) == 1 or not effect.target:
+    """Return the effect's name, with its target where several candidates share the name, single ones of many aside."""
+    same = [e for e in among if e.name == effect.name]
+    single = is_single_of_many(effect, among)
+    alone = len(same) == 1 or (not single and sum(not is_single_of_many(e, among) for e in same) == 1)
+    if alone or not effect.target:
         return effect.name
     if len(effect.elements) == 1:
         return f"{effect.name}({', '.join(effect.target)})"

@@ -27,11 +27,6 @@ from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
 from concent_warp.simulate.time_limit import TimeUpError
 
 
-def _always(one: FittedModel) -> bool:  # noqa: ARG001
-    """Return whether nominal values at their bounds may stay, whatever a model leaves."""
-    return True
-
-
 class Additions:
     """Adds effects to fitted models."""
 
@@ -246,11 +241,10 @@ class Additions:
     ) -> list[FittedModel] | None:
         """Return the fitted models, the last with nominal values and, where that explains more, a shorter time step.
 
-        It is None where nominal values explain nothing more. Without an effect they may be at their bounds: one that is
-        missing explains more than they do. Beside an effect they may where they leave no more than an error in its
-        formula, which they take up before another effect does.
+        It is None where nominal values explain nothing more. Beside an effect they may be at their bounds where they
+        leave no more than an error in its formula, which they take up before another effect does.
         """
-        enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else _always
+        enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
         both = None if finer is None else self.context.nominal(finer, enough)
         plain = self.context.nominal(fitted[-1], enough)
         if finer is not None and both is not None and (plain is None or self._needs_step(plain, both)):

@@ -14,7 +14,7 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_from_rivals
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.candidates.candidates import candidates, label
+from concent_warp.diagnosis.candidates.candidates import candidates, is_single_of_many, label
 from concent_warp.diagnosis.candidates.evidence import (
     AT_NULL,
     assess,
@@ -282,11 +282,6 @@ class AdditionFinder:
         names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
         context.progress(ranking(base, screened, names, cfg.seed))
         return self.gradient.apply(base, screened, context.runner) if self.gradient else screened
-
-
-def is_single_of_many(effect: Effect, among: Sequence[Effect]) -> bool:
-    """Return whether an effect acts on one of several elements, and is considered after that on all of them."""
-    return effect.singles_last and any(e.name == effect.name and set(effect.target) < set(e.target) for e in among)
 
 
 def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:
