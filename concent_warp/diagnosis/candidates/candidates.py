@@ -51,9 +51,9 @@ def is_single_of_many(effect: Effect, among: Sequence[Effect]) -> bool:
 def label(effect: Effect, among: Sequence[Effect]) -> str:
     """Return the effect's name, with its target where several candidates share the name, single ones of many aside."""
     same = [e for e in among if e.name == effect.name]
-    single = is_single_of_many(effect, among)
-    alone = len(same) == 1 or (not single and sum(not is_single_of_many(e, among) for e in same) == 1)
-    if alone or not effect.target:
+    if len(same) == 1 or not effect.target:
+        return effect.name
+    if not is_single_of_many(effect, same) and sum(not is_single_of_many(e, same) for e in same) == 1:
         return effect.name
     if len(effect.elements) == 1:
         return f"{effect.name}({', '.join(effect.target)})"

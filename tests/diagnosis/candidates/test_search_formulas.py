@@ -315,7 +315,8 @@ def test_the_smallest_detectable_size_is_of_the_most_sensitive_parameter():
 
 def test_labels_have_targets_where_names_are_shared():
     def effect(name: str, *target: str, part: str = "") -> Any:
-        return SimpleNamespace(name=name, target=(*target, part) if part else target, elements=target, part=part)
+        of = (*target, part) if part else target
+        return SimpleNamespace(name=name, target=of, elements=target, part=part, singles_last=False)
 
     one, two, three, four = effect("a", "x"), effect("a", "x", "y"), effect("b", "x"), effect("a", "x", "y", part="kp")
     among = [one, two, three, four]
