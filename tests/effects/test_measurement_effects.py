@@ -73,6 +73,12 @@ def test_bias_adds_and_gain_multiplies(effect, expected):
     np.testing.assert_allclose(reading(PENDULUM, effect("encoder"), [0.05], "encoder")[:, 0], expected)
 
 
+def test_a_bias_is_in_the_unit_of_what_the_sensor_reads():
+    xml = PENDULUM.replace("</sensor>", '<jointvel name="rate" joint="hinge"/><clock name="time"/></sensor>')
+    units = [p.unit for p in SensorBias("encoder", "rate", "time").parameters(world(xml).compile())]
+    assert units == ["rad", "rad/s", "SI unit"]
+
+
 def seen(effect: Effect, values: list[float], xml: str, sensor: str) -> np.ndarray:
     """Return what an effect reads of a body at (t, 2 t, 3), an orientation about x by t, or an angle t^2."""
 

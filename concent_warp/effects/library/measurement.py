@@ -275,7 +275,7 @@ def _unit_of_reading(m: mujoco.MjModel, sensor: str) -> str:
     """Return the unit of what a sensor reads, where it is a joint's position or velocity."""
     i = m.sensor(sensor).id
     if int(m.sensor_type[i]) not in JOINTS:
-        return "its unit"
+        return "SI unit"
     position = "m" if int(m.jnt_type[m.sensor_objid[i]]) == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
     return position if int(m.sensor_type[i]) == JOINTS[0] else f"{position}/s"
 
