@@ -269,6 +269,14 @@ class TimeStepCfg:
     error_factor: Factor = 1.5
     """By how much that error may be larger than a first-order one [-]: motion that amplifies small differences does.
     Empirical."""
+    max_lengthening: Annotated[int, Bounds(1, 1000)] = 8
+    """Most of the model's steps that simulations take at once while effects are looked for; 1 for none."""
+    max_error_of_longer: Positive = 0.5
+    """Change by such a longer step over the noise [-], beyond what initial states and the model's own parameters take
+    up. Predictions are corrected for it; what remains is how it differs from one candidate to another."""
+    max_share_of_contact: Positive = 0.2
+    """Longest such step over the shortest time constant of the model's contacts [-]: MuJoCo's contacts are no stiffer
+    than two steps, and candidates may be up to twice and a half as stiff as the model."""
     decisive_gain: Share = 0.9
     """Share of the error that a shorter step must remove to be used before effects are looked for [-]: an effect that
     removes more still is more likely to stand in for the step and a part of what else is missing. Empirical."""

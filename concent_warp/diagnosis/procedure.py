@@ -39,7 +39,7 @@ from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.impact_errors import stand
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
-from concent_warp.diagnosis.search.time_step import may_be_step
+from concent_warp.diagnosis.search.time_step import corrected, longer_time_step, may_be_step, renew_defects
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -105,9 +105,9 @@ class Procedure:
         runner.enter(BASELINE_DONE, ADDITIONS_DONE)
         with context.budget.until(SEARCH_SHARE):
             start = self.additions.with_holding(given)
-            context.record.held_first = len(context.record.holding)
-            begun, fitted, detectable = self.search_beside_impacts(start)
-        if start is given:
+            context.record.held_first, is_given = len(context.record.holding), start is given
+            begun, fitted, detectable = self.search_beside_impacts(self._with_longer_step(start))
+        if is_given:
             given = begun
         else:
             self.held = begun
@@ -223,10 +223,11 @@ class Procedure:
         found = []
         for one in followed:
             begun = [offset * w.spread for offset, w in zip(one.fit.offsets, given.windows, strict=True)]
-            windows = with_scatter(one.model, given.windows, self.engine, observation, begun)
+            plain = [replace(w, defect=None) for w in given.windows]
+            windows = with_scatter(one.delivered, plain, self.engine, observation, begun)
             more = [_directions(a) > _directions(b) for a, b in zip(windows, given.windows, strict=True)]
             if any(more):
-                found.append(self._refitted(given.model, windows))
+                found.append(self._refitted(given.model, windows, given.timestep))
         rough, far = min(found, key=lambda one: one.ratio, default=None), self.context.is_far_off
         if rough is not None and far(fitted[-1], given):
             return None if far(self._refitted(fitted[-1].model, rough.windows), rough) else rough
@@ -328,10 +329,23 @@ class Procedure:
                 break
         return found
 
-    def _refitted(self, model: Model, windows: Sequence[Window]) -> FittedModel:
-        """Return a model with its own parameters and the initial states fitted to some windows."""
-        fits = self.context.cfg.fits
-        return fit_baseline(model, windows, cut_blocks(windows, fits.blocks), self.engine, cfg=fits)
+    def _with_longer_step(self, one: FittedModel) -> FittedModel:
+        """Return a fitted model whose simulations take longer steps where that changes little."""
+        context = self.context
+        context.progress("trying longer time steps")
+        unsettled = "Not tried: longer time steps."
+        return context.budget.attempt(lambda: longer_time_step(one, context.cfg.time_step), one, unsettled)
+
+    def _refitted(self, model: Model, windows: Sequence[Window], timestep: float | None = None) -> FittedModel:
+        """Return a model with its own parameters and the initial states fitted to some windows.
+
+        Predictions are those of a time step [s], by default that of the model as given, also where simulations take
+        longer ones.
+        """
+        fits, cfg = self.context.cfg.fits, self.context.cfg.time_step
+        found = fit_baseline(model, windows, cut_blocks(windows, fits.blocks), self.engine, cfg=fits)
+        aimed = self.model.scene.model.opt.timestep if timestep is None else timestep
+        return corrected(found, aimed, cfg) if found.timestep > aimed else renew_defects(found, cfg)
 
     def baseline(self) -> FittedModel:
         """Return the model as given, with its own parameters and the initial states fitted."""
@@ -440,7 +454,7 @@ class Procedure:
             detectable=detectable,
             next_experiment=experiment,
             issues=(*issues, *self._said_of_impacts()),
-            models=(given.model, *(one.delivered for one in after)),
+            models=(given.delivered, *(one.delivered for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
             form_error=form_error if named else None,
@@ -457,7 +471,7 @@ class Procedure:
     def _replayed(self, given: FittedModel, last: FittedModel) -> Replayed | None:
         """Return what a replay in one piece says of the last model."""
         limit = self.context.cfg.doubtful_replay
-        return replayed(given.model, last.delivered, self.recording, last.windows, limit, self.engine)
+        return replayed(given.delivered, last.delivered, self.recording, last.windows, limit, self.engine)
 
     def _said_of_impacts(self) -> tuple[str, ...]:
         """Return a sentence on what the answer leaves of impacts, none where it leaves nothing."""
@@ -475,14 +489,16 @@ class Procedure:
             return None
         cfg = self.context.cfg
         cfg = replace(cfg.experiment, seed=cfg.seed, observation=cfg.fits.observation)
-        return suggest_experiment(groups[0], self.recording, cfg, engine=self.engine)
+        given = self.model.scene.model.opt.timestep
+        models = {name: replace(m, scene=m.scene.with_timestep(given)) for name, m in groups[0].items()}
+        return suggest_experiment(models, self.recording, cfg, engine=self.engine)
 
     def _failures(self, given: FittedModel) -> tuple[Mapping[str, Any], ...]:
         """Return where the model as given fails."""
         cfg = self.context.cfg.failures
         return tuple(
             locate_failures(
-                given.model,
+                given.delivered,
                 self.recording,
                 replace(cfg, max_seconds=min(cfg.max_seconds, self.context.budget.left())),
                 engine=self.engine,

@@ -144,11 +144,16 @@ def _from(additions: Additions, first: FittedModel, rival: Rival) -> list[Fitted
         hypotheses=[{instead.name: begun.model}],
         widening={0: np.ones(len(instead.parameters))},
         rivals={0: before.rivals[0]},
-        time_step=None if first.windows[0].defect is None else before.time_step,
+        time_step=before.time_step if _is_of(first, before) else None,
         holding=before.holding[: before.held_first],
         held_first=before.held_first,
     )
     return additions.add_effects([first, begun], ())[0]
+
+
+def _is_of(one: FittedModel, record: SearchRecord) -> bool:
+    """Return whether a fitted model has the shorter time step of a record."""
+    return record.time_step is not None and one.timestep == record.time_step.used
 
 
 def plausibility(one: FittedModel) -> float:

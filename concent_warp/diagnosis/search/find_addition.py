@@ -243,7 +243,8 @@ class AdditionFinder:
 
         What other ones leave has the structure of their errors.
         """
-        return self.context.cfg.nominal.enabled and base.windows[0].defect is None and not nominal_effects(base.model)
+        given = self.context.record.time_step is None and not nominal_effects(base.model)
+        return self.context.cfg.nominal.enabled and given
 
     def _is_beside_nominal(self, base: FittedModel, c: FittedCandidate, shared: NominalSensitivities | None) -> bool:
         """Return whether a candidate removes enough beside all nominal values within their tolerance.

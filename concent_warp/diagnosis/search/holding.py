@@ -41,7 +41,8 @@ def hold(
 
 
 def with_scene(last: FittedModel, scene: Scene, cfg: TimeStepCfg) -> FittedModel:
-    """Return a fitted model with another scene, all parameters fitted again."""
+    """Return a fitted model with another scene but for the time step, all parameters fitted again."""
+    scene = scene.with_timestep(last.model.scene.model.opt.timestep)
     return renew_defects(refitted(replace(last, model=replace(last.model, scene=scene))), cfg)
 
 

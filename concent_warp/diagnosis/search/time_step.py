@@ -4,6 +4,9 @@ To first order, a prediction is off by a term in proportion to the time step (Ha
 Ordinary Differential Equations I", 1993, section II.3), so that the difference to the prediction with half the step is
 half that term. Where it is not small beside the noise, the model with a step short enough is a rival of every effect;
 it has no parameters and therefore wins where both explain the data.
+
+Where even a longer step changes little, simulations take that while effects are looked for, which is most of the time
+of a diagnosis; what the model's own step changes is added in the same way.
 """
 
 from __future__ import annotations
@@ -24,6 +27,26 @@ from concent_warp.fit.effects.observation import TimeStepDefect, Window
 from concent_warp.fit.effects.robust import cauchy_weight
 
 
+def longer_time_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel:
+    """Return a fitted model whose simulations take longer steps where that changes little, corrected for the change.
+
+    Args:
+        base: The fitted model, whose predictions are those of its own time step.
+        cfg: Settings.
+    """
+    given = base.timestep
+    for factor in range(min(cfg.max_lengthening, int(_longest_step(base, cfg) / given + 1e-9)), 1, -1):
+        longer = _with_time_step(base, factor * given)
+        if _change(base, longer) <= cfg.max_error_of_longer:
+            return _with_defects(longer, given)
+    return base
+
+
+def corrected(one: FittedModel, timestep: float, cfg: TimeStepCfg) -> FittedModel:
+    """Return a fitted model with the predictions of a shorter time step [s], fitted again."""
+    return renew_defects(refitted(_with_defects(one, timestep)), cfg)
+
+
 def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     """Return a fitted model with a shorter time step where that explains significantly more, else None.
 
@@ -36,7 +59,7 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     division = _division(base, cfg.time_step)
     if division < 2:
         return None
-    finer = _with_defects(base, base.model.scene.model.opt.timestep / division)
+    finer = _with_defects(base, base.timestep / division)
     before = robust_sum(base, [piece.residual for piece in base.pieces])
     promised = 1 - robust_sum(base, projected_residuals(base, finer)) / max(before, 1e-12)
     if promised < cfg.search.min_expected_gain * cfg.min_gain:
@@ -96,12 +119,15 @@ def _defect(window: Window) -> np.ndarray:
     return np.zeros(window.count) if window.defect is None else window.defect.residual
 
 
-def at_given_step(last: FittedModel) -> FittedModel:
-    """Return a fitted model with the time step as given, all parameters fitted again."""
+def at_given_step(last: FittedModel, timestep: float, cfg: TimeStepCfg) -> FittedModel:
+    """Return a fitted model with the time step as given [s], all parameters fitted again."""
     plain = _without_defects(last)
+    if plain.timestep > timestep:
+        plain = _with_defects(plain, timestep)
     solver = plain.solver()
     fit = solver.fit(offsets=last.fit.offsets, starts=last.fit.starts)
-    return fitted_model(solver.p.model(fit.values), plain.windows, last.blocks, fit, last.engine, last.cfg)
+    found = fitted_model(solver.p.model(fit.values), plain.windows, last.blocks, fit, last.engine, last.cfg)
+    return renew_defects(found, cfg)
 
 
 def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
@@ -177,12 +203,27 @@ def projected_residuals(base: FittedModel, other: FittedModel) -> list[np.ndarra
 
 def _division(base: FittedModel, cfg: TimeStepCfg) -> int:
     """Return into how many parts to divide the time step, so that its error is small beside the noise."""
-    half = _residuals(_with_time_step(base, base.model.scene.model.opt.timestep / 2))
-    change = [a - piece.residual for a, piece in zip(half, base.fit.linear, strict=True)]
-    error = 2 * noise_ratio(np.concatenate(_without_own(base, _projected(base, change))))
+    error = 2 * _change(base, _with_time_step(_without_defects(base), base.timestep / 2))
     if not np.isfinite(error):
         return 1
     return int(np.clip(np.ceil(error / cfg.max_error), 1, cfg.max_division))
+
+
+def _change(base: FittedModel, other: FittedModel) -> float:
+    """Return the RMS change of the residuals of a fitted model by another time step, over the noise [-].
+
+    What changes of initial states and the model's own parameters take up to first order is left out.
+    """
+    change = [a - piece.residual for a, piece in zip(_residuals(other), base.fit.linear, strict=True)]
+    return noise_ratio(np.concatenate(_without_own(base, _projected(base, change))))
+
+
+def _longest_step(base: FittedModel, cfg: TimeStepCfg) -> float:
+    """Return the longest time step that simulations of candidates may take [s], infinite without contacts."""
+    m = base.model.scene.model
+    touchable = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+    constants = np.concatenate([m.geom_solref[touchable, 0], m.pair_solref[:, 0], m.eq_solref[:, 0]])
+    return cfg.max_share_of_contact * float(constants[constants > 0].min(initial=np.inf))
 
 
 def _with_time_step(base: FittedModel, timestep: float) -> FittedModel:

@@ -35,6 +35,9 @@ class PredictionCfg:
     extrapolation: Duration = 0.05
     """Time before and after a window over which predictions are continued linearly [s]: readings may be delayed by as
     much."""
+    call_steps: Annotated[int, Bounds(0, 10**6)] = 300
+    """Steps of a simulation that take as long as what a call of the engine costs besides: windows that differ by fewer
+    in all are simulated in one."""
     cache_bytes: Annotated[int, Bounds(0, 2**40)] = 2**25
     """Size of the simulations that are kept for repeated requests [bytes]."""
 
@@ -204,15 +207,17 @@ class Prediction:
     def courses(self, trials: Sequence[SimulationRequest], time: float | None = None) -> list[Course]:
         """Simulate trials, each to the end of its window or for some time [s] only."""
         courses: list[Course | None] = [None] * len(trials)
-        groups: dict[tuple[tuple[float, ...], int], list[int]] = {}
+        groups: dict[tuple[float, ...], list[int]] = {}
+        steps = [self._steps(trial.window, time) for trial in trials]
         for i, trial in enumerate(trials):
             key = tuple(float(v) for e in self._edits for v in trial.values[self.split[e]])
-            groups.setdefault((key, self._steps(trial.window, time)), []).append(i)
-        for (_, steps), members in groups.items():
-            engine, bare = self._engine(trials[members[0]].values)
-            simulated = self._simulate(engine, bare, [trials[i] for i in members], steps)
-            for i, course in zip(members, simulated, strict=True):
-                courses[i] = course
+            groups.setdefault(key, []).append(i)
+        for alike in groups.values():
+            for members in of_similar_length(alike, steps, self.cfg.call_steps):
+                engine, bare = self._engine(trials[members[0]].values)
+                simulated = self._simulate(engine, bare, [trials[i] for i in members], [steps[i] for i in members])
+                for i, course in zip(members, simulated, strict=True):
+                    courses[i] = course
         return [c for c in courses if c is not None]
 
     def _steps(self, window: int, time: float | None) -> int:
@@ -222,10 +227,10 @@ class Prediction:
         return max(int(np.ceil(span / self.timestep - 1e-9)), 1)
 
     def _simulate(
-        self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[SimulationRequest], steps: int
+        self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[SimulationRequest], lengths: Sequence[int]
     ) -> list[Course]:
-        """Simulate trials of equal length in one engine."""
-        m, n = engine.compiled, len(trials)
+        """Simulate trials of similar lengths [steps] in one engine, all for as long as the longest."""
+        m, n, steps = engine.compiled, len(trials), max(lengths)
         values = np.array([t.values for t in trials])
         qpos, qvel, ctrl = np.empty((n, m.nq)), np.empty((n, m.nv)), np.empty((n, steps, m.nu))
         plain = {}
@@ -249,9 +254,12 @@ class Prediction:
         rollout = engine.run(variants, ctrl, bodies=[]).numpy()
         self.simulated += n * steps * m.opt.timestep
         courses = []
-        for trial, qpos, qvel, read in zip(trials, rollout.qpos, rollout.qvel, rollout.sensordata, strict=True):
-            own, time = read.copy(), rollout.time - trial.early  # no part of the array of all, which would live as long
-            courses.append(Course(SensorReader(m, time, own, self.cfg.extrapolation), qpos, qvel, own.nbytes))
+        found = zip(trials, lengths, rollout.qpos, rollout.qvel, rollout.sensordata, strict=True)
+        for trial, length, qpos, qvel, read in found:
+            part = slice(length + 1)
+            own, time = read[part].copy(), rollout.time[part] - trial.early  # the array of all would live as long
+            reader = SensorReader(m, time, own, self.cfg.extrapolation)
+            courses.append(Course(reader, qpos[part], qvel[part], own.nbytes))
         return courses
 
     def first_time(self, w: Window, values: np.ndarray) -> float:
@@ -329,6 +337,25 @@ class Prediction:
         """Return the residuals of each trial, see `observed`."""
         readers = self.readers(trials)
         return [self.observed(t.window, r, t.values) for t, r in zip(trials, readers, strict=True)]
+
+
+def of_similar_length(members: Sequence[int], steps: Sequence[int], most: int) -> list[list[int]]:
+    """Return simulations in parts, each of which is simulated for as long as its longest takes.
+
+    Args:
+        members: Indices of the simulations.
+        steps: Steps of each by index.
+        most: Most steps beyond the own ones that all simulations of a part take together, but for equal ones.
+    """
+    found: list[list[int]] = []
+    extra = 0
+    for i in sorted(members, key=lambda i: -steps[i]):
+        extra += steps[found[-1][0]] - steps[i] if found else 0
+        if not found or extra > most:
+            found.append([])
+            extra = 0
+        found[-1].append(i)
+    return found
 
 
 class SensorReader:
