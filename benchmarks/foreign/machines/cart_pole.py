@@ -21,7 +21,7 @@ MODEL = """
       <geom type="box" size="0.06 0.04 0.03" contype="0" conaffinity="0"/>
       <body name="pole">
         <inertial pos="0 0 -0.22" mass="0.18" diaginertia="0.0031 0.0031 0.00002"/>
-        <joint name="pivot" type="hinge" axis="0 -1 0" damping="0.0025" frictionloss="0.0008"/>
+        <joint name="pivot" type="hinge" axis="0 -1 0" damping="0.009" frictionloss="0.0008"/>
         <geom type="capsule" fromto="0 0 0 0 0 -0.44" size="0.006" contype="0" conaffinity="0"/>
       </body>
     </body>
@@ -45,7 +45,7 @@ class Values(NamedTuple):
     inertia: float = 0.0031
     damping: float = 5.0
     friction: float = 1.2
-    pivot_damping: float = 0.0025
+    pivot_damping: float = 0.009
     pivot_friction: float = 0.0008
     gear: float = 40.0
     tilt: float = 0.0
@@ -77,8 +77,8 @@ def derivative(t: float, y: np.ndarray, u: np.ndarray, p: Values, dy: np.ndarray
 def motions(rng: np.random.Generator) -> list[Motion]:
     """Return a motion with sines and one with steps of the torque."""
     t = clock(6.0, 200)
-    slow = sines(t, (0.11, 0.5 * rng.uniform(0.9, 1.1), 1.2), (0.1, 1.7 * rng.uniform(0.95, 1.05), 0))
-    pushes = [(0, 0), (0.5, 0.12), (1.1, -0.14), (2.0, 0.09), (2.4, 0), (3.0, 0.155), (3.5, -0.12), (4.4, 0)]
+    slow = sines(t, (0.1, 0.5 * rng.uniform(0.9, 1.1), 1.2), (0.08, 1.7 * rng.uniform(0.95, 1.05), 0))
+    pushes = [(0, 0), (0.5, 0.1), (0.9, -0.12), (1.8, 0.08), (2.3, 0), (3.0, 0.13), (3.3, -0.08), (4.2, 0)]
     jumps = steps(t, pushes)
     return [Motion(6.0, {"belt": Held(t, np.round(slow, 5))}), Motion(6.0, {"belt": Held(t, jumps)})]
 
@@ -102,16 +102,16 @@ MACHINE = Machine(
 
 CASES: tuple[Case, ...] = (
     MACHINE.case("null", "null", habits=Habits(jitter=2e-4)),
-    MACHINE.case("dry_bearing", "single", (("joint_friction",),), Hidden(added={"friction": 0.2})),
-    MACHINE.case("sloping_rail", "single", (("gravity_tilt",),), Hidden(added={"tilt": 0.004}), Habits(stated=True)),
+    MACHINE.case("dry_bearing", "single", (("joint_friction",),), Hidden(added={"friction": 0.18})),
+    MACHINE.case("sloping_rail", "single", (("gravity_tilt",),), Hidden(added={"tilt": 0.003}), Habits(stated=True)),
     MACHINE.case(
-        "weak_supply", "single", (("actuator_saturation",),), Hidden(factors={"limit": 5.8e-3}), Habits(lost=0.01)
+        "weak_supply", "single", (("actuator_saturation",),), Hidden(factors={"limit": 5.4e-3}), Habits(lost=0.01)
     ),
     MACHINE.case(
         "friction_and_pole_zero",
         "pair",
         (("joint_friction",), ("sensor_bias", "joint_offset")),
-        Hidden(added={"friction": 0.2}, bias={"pole": 0.012}),
+        Hidden(added={"friction": 0.18}, bias={"pole": 0.012}),
         Habits(stated=True),
     ),
     MACHINE.case("emptying_battery", "outside", (), Hidden(added={"sag": 0.16}), Habits(stated=True)),

@@ -133,5 +133,5 @@ CASES: tuple[Case, ...] = (
         Habits(stated=True),
     ),
     MACHINE.case("lens_ahead", "single", (("center_of_mass",),), Hidden(added={"ahead": 0.002})),
-    MACHINE.case("cable", "outside", (), Hidden(added={"cable": 0.05}), Habits(stated=True)),
+    MACHINE.case("cable", "outside", (), Hidden(added={"cable": 0.03}), Habits(stated=True)),
 )

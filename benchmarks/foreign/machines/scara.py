@@ -222,6 +222,6 @@ CASES: tuple[Case, ...] = (
     MACHINE.case("worn_gear", "single", (("backlash",),), Hidden(added={"play": 0.012})),
     MACHINE.case("elbow_zero", "single", (("joint_offset",),), Hidden(added={"offset": 0.02}), Habits(stated=True)),
     MACHINE.case("biased_encoder", "single", (("sensor_bias",),), Hidden(bias={"encoder1": 0.006}), Habits(lost=0.01)),
-    MACHINE.case("heavy_flange", "single", (("mass",),), Hidden(added={"mass4": 0.4}), Habits(stated=True)),
-    MACHINE.case("forgotten_bracket", "outside", (), Hidden(added={"wall": -9.28})),
+    MACHINE.case("heavy_flange", "single", (("mass",),), Hidden(added={"mass4": 0.6}), Habits(stated=True)),
+    MACHINE.case("forgotten_bracket", "outside", (), Hidden(added={"wall": -9.25})),
 )
