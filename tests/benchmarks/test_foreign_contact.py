@@ -116,16 +116,16 @@ def ball_beam_case():
 def door_push_case():
     t = command_times(door_push.DURATION)
     command = Command(t, 0.2 * np.clip((t - 0.2) / 0.8, 0, 1))
-    path = door_push.swing(door_push.Door(), command)
-    simulated = replayed(door_push.MODEL, [command], door_push.DURATION, lambda d: d.qpos[[1, 0]].copy())
+    path = door_push.swing(door_push.Door(), command, duration=2.5)
+    simulated = replayed(door_push.MODEL, [command], 2.5, lambda d: d.qpos[[1, 0]].copy())
     return simulated, path.state[10::10, [0, 2]]
 
 
 def gripper_lift_case():
     height, force = gripper_lift.commands(gripper_lift.RUNS[0])
-    path = gripper_lift.lift(gripper_lift.Gripper(), height, force)
+    path = gripper_lift.lift(gripper_lift.Gripper(), height, force, duration=2.5)
     commands = [height, force, force]
-    simulated = replayed(gripper_lift.MODEL, commands, gripper_lift.DURATION, lambda d: d.qpos[[0, 5]] - [0.0, 0.03])
+    simulated = replayed(gripper_lift.MODEL, commands, 2.5, lambda d: d.qpos[[0, 5]] - [0.0, 0.03])
     return simulated, path.state[10::10, [0, 2]]
 
 

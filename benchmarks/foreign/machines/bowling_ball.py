@@ -107,7 +107,7 @@ CASES = cases(
     (
         Cause("nothing", "null"),
         Cause("carpet", "single", (("rolling_friction",),), {"rolling": 2.5}, noise_stated=True),
-        Cause("flattened_pole", "single", (("torsional_friction",),), {"torsion": 1.8}),
+        Cause("flattened_pole", "single", (("torsional_friction",),), {"torsion": 1.35}),
         Cause("hollow", "single", (("inertia",),), {"inertia": 1.5}, noise_stated=True),
         Cause("larger_ball", "single", (("size", "contact_geometry"),), {"radius": 1.06}),
         Cause(

@@ -92,7 +92,7 @@ def stroke(way: float, time: float) -> Command:
 
 def record(bench: Bench, rng: Rng) -> tuple[Sequence[Recorded], Mapping[str, float]]:
     """Return three pushes."""
-    encoder = Encoder(rate=250.0, step=2e-5, noise=4e-5)
+    encoder = Encoder(rate=250.0, step=5e-5, noise=8e-5)
     camera = Camera(rate=60.0, noise=4e-4, turn_noise=0.004, lost=0.02, latency=bench.latency)
     motions = []
     for way, time in STROKES:
@@ -118,9 +118,9 @@ CASES = cases(
     VARIED,
     (
         Cause("nothing", "null"),
-        Cause("dusty_table", "single", (("sliding_friction",),), {"friction": 0.75}, noise_stated=True),
-        Cause("filled_box", "single", (("mass",),), {"box": 1.6}),
-        Cause("slow_drive", "single", (("actuator_lag",),), values={"lag": 0.04}, noise_stated=True),
+        Cause("dusty_table", "single", (("sliding_friction",),), {"friction": 0.8}, noise_stated=True),
+        Cause("filled_box", "single", (("mass",),), {"box": 2.2}),
+        Cause("slow_drive", "single", (("actuator_lag",),), values={"lag": 0.015}, noise_stated=True),
         Cause(
             "rough_table_late_camera",
             "pair",

@@ -99,7 +99,7 @@ CASES = cases(
     VARIED,
     (
         Cause("nothing", "null", noise_stated=True),
-        Cause("dead_rubber", "single", (("contact_compliance",),), {"damping": 1.5}),
+        Cause("dead_rubber", "single", (("contact_compliance",),), {"damping": 1.25}),
         Cause("ribbons", "single", (("air_drag",),), {"drag": 3.0}, noise_stated=True),
         Cause("fan", "single", (("wind",),), values={"wind": (2.2, -0.8)}),
         Cause(

@@ -45,7 +45,7 @@ BOX = (0.1, -0.05, 0.52)
 """Where the box stands [m]."""
 SHAKES = ((0.05, 0.0, 1.8, 0.0), (0.0, 0.06, 1.6, 0.0), (0.04, 0.04, 1.9, 1.3))
 """Amplitudes along x and y [m], frequency [Hz], and by how much y is ahead [rad]."""
-DURATION = 2.5
+DURATION = 2.1
 
 
 @dataclass(frozen=True)
@@ -137,10 +137,10 @@ CASES = cases(
     (
         Cause("nothing", "null"),
         Cause("greasy", "single", (("sliding_friction",),), {"friction": 0.75}, noise_stated=True),
-        Cause("slow_bus", "single", (("actuator_delay", "latency"),), values={"delay": 0.02}),
+        Cause("slow_bus", "single", (("actuator_delay", "latency"),), values={"delay": 0.008}),
         Cause("camera_not_scaled", "single", (("length_scale",),), values={"scale": 0.03}, noise_stated=True),
-        Cause("heavy_box", "single", (("mass",),), {"box": 1.8}),
-        Cause("soap_on_one_side", "outside", values={"soap": 0.5}, noise_stated=True),
+        Cause("heavy_box", "single", (("mass",),), {"box": 3.0}),
+        Cause("soap_on_one_side", "outside", values={"soap": 0.8}, noise_stated=True),
     ),
     record,
 )

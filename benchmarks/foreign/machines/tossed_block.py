@@ -104,7 +104,7 @@ CASES = cases(
     (
         Cause("nothing", "null"),
         Cause("lead_in_a_corner", "single", (("center_of_mass",),), values={"centre": (0.009, -0.005, 0.0)}),
-        Cause("slabs_on_the_ends", "single", (("inertia",),), {"inertia_x": 1.35}, noise_stated=True),
+        Cause("mass_moved_outward", "single", (("inertia",),), {"inertia_x": 1.35}, noise_stated=True),
         Cause("slow_clock", "single", (OTHER_GRAVITY,), values={"clock": -0.02}, noise_stated=True),
         Cause(
             "lead_and_fast_clock",
@@ -112,7 +112,7 @@ CASES = cases(
             (("center_of_mass",), OTHER_GRAVITY),
             values={"centre": (-0.007, 0.004, 0.004), "clock": 0.025},
         ),
-        Cause("spinning_wheel_inside", "outside", values={"wheel": (0.0, 0.006, 0.003)}, noise_stated=True),
+        Cause("spinning_wheel_inside", "outside", values={"wheel": (0.0, 0.004, 0.002)}, noise_stated=True),
     ),
     record,
 )
