@@ -1,0 +1,153 @@
+"""Machines with contacts: their equations keep laws that they do not state, and agree with MuJoCo."""
+
+from __future__ import annotations
+
+from math import radians
+
+import mujoco
+import numpy as np
+import pytest
+
+from benchmarks.foreign.contact import GRAVITY, Slab, integrate
+from benchmarks.foreign.machines import ball_beam, bowling_ball, door_push, gripper_lift, push_box, tossed_block
+from benchmarks.foreign.readings import Command, command_times, conjugate, turned
+
+STEPS = 1000
+"""Steps of the models per second."""
+
+
+def stopping_distance():
+    """Return how far a pushed box slides on once it is free, and v^2 / (2 mu g)."""
+    bench = push_box.Bench()
+    path = push_box.push(bench, push_box.stroke(*push_box.STROKES[1]))
+    gap = path[2] - bench.half_length - push_box.TIP - path[0]
+    free = np.argmax((gap > 1e-4) & (path.time > 0.4))
+    return path[2][-1] - path[2][free], path[3][free] ** 2 / (2 * bench.friction * GRAVITY)
+
+
+def speed_of_rolling():
+    """Return the speed at which a ball that slid without turning rolls, and 5/7 of that at the beginning."""
+    lane = bowling_ball.Lane(rolling=0.0)
+    path = bowling_ball.roll(lane, (0.0, 0.0, 1.2, 0.0, 0.0, 0.0, 0.0, 1.0))
+    return path[2][-1], 5 / 7 * 1.2
+
+
+def turn_of_a_spinning_ball():
+    """Return the angle at which a spinning ball stops, and its kinetic energy by the torque of friction."""
+    lane = bowling_ball.Lane()
+    path = bowling_ball.roll(lane, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 12.0, 1.6))
+    angle = np.sum(path[6]) * (path.time[1] - path.time[0])
+    return angle, lane.inertia * 12.0**2 / 2 / (lane.torsion * lane.mass * GRAVITY)
+
+
+def work_of_friction_on_a_slab():
+    """Return the energy that a box loses while it slides and turns, and the work of friction on it."""
+    slab, mass, moment = Slab(0.05, 0.03, 0.02), 0.4, 5e-4
+
+    def rate(_, s):
+        fx, fy, torque = slab.friction(s[2], (s[3], s[4], s[5]), mass * GRAVITY, lambda *_: (0.2, 0.2))
+        power = fx * s[3] + fy * s[4] + torque * s[5]
+        return s[3], s[4], s[5], fx / mass, fy / mass, torque / moment, power
+
+    path = integrate(rate, (0, 0, 0, 0.8, -0.3, 5.0, 0), 0.25, step=2e-4)
+    energy = mass * (path[3] ** 2 + path[4] ** 2) / 2 + moment * path[5] ** 2 / 2
+    return energy[-1] - energy[0], path[6][-1]
+
+
+@pytest.mark.parametrize(
+    ("law", "share"),
+    [
+        (stopping_distance, 0.01),
+        (speed_of_rolling, 1e-3),
+        (turn_of_a_spinning_ball, 0.01),
+        (work_of_friction_on_a_slab, 1e-3),
+    ],
+)
+def test_motion_keeps_a_law_that_the_equations_do_not_state(law, share):
+    found, expected = law()
+    assert found == pytest.approx(expected, rel=share)
+
+
+def test_angular_momentum_and_energy_of_a_thrown_block_stay():
+    block = tossed_block.Block(wheel=(0.0, 0.006, 0.003))
+    path = tossed_block.fly(block, tossed_block.THROWS[3])
+    moments = np.array([block.inertia_x, block.inertia_y, block.inertia_z])
+    turn = path.state[:, 4:]
+    momentum = turned(path.state[:, :4], moments * turn + np.array(block.wheel))
+    np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(turn), 1)), atol=1e-8)
+    energy = turn**2 @ moments / 2
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-7)
+
+
+def replayed(model, commands, duration, read, start=None):
+    """Return what MuJoCo says of a model under commands, at each of its steps."""
+    m = mujoco.MjModel.from_xml_string(model)
+    d = mujoco.MjData(m)
+    if start is not None:
+        start(d)
+    rows = []
+    for k in range(round(duration * STEPS)):
+        d.ctrl[:] = [command(k / STEPS) for command in commands]
+        mujoco.mj_step(m, d)
+        rows.append(read(d))
+    return np.array(rows)
+
+
+def push_box_case():
+    command = push_box.stroke(*push_box.STROKES[0])
+    path = push_box.push(push_box.Bench(), command)
+    simulated = replayed(push_box.MODEL, [command], push_box.DURATION, lambda d: d.qpos[:2].copy())
+    return simulated, path.state[10::10, [0, 2]]
+
+
+def ball_beam_case():
+    t = command_times(2.0, 200.0)
+    command = Command(t, 0.08 * np.sin(2 * np.pi * 0.8 * t))
+    path = ball_beam.run(ball_beam.Beam(), 0.05, command, duration=2.0)
+
+    def place(d):
+        d.qpos[1] = 0.05
+
+    simulated = replayed(ball_beam.MODEL, [command], 2.0, lambda d: d.qpos[:2].copy(), place)
+    x = path[0] * np.cos(path[2]) + 0.03 * np.sin(path[2])
+    return simulated, np.stack([path[2], x], axis=1)[5::5]
+
+
+def door_push_case():
+    t = command_times(door_push.DURATION)
+    command = Command(t, 0.2 * np.clip((t - 0.2) / 0.8, 0, 1))
+    path = door_push.swing(door_push.Door(), command, duration=2.5)
+    simulated = replayed(door_push.MODEL, [command], 2.5, lambda d: d.qpos[[1, 0]].copy())
+    return simulated, path.state[10::10, [0, 2]]
+
+
+def gripper_lift_case():
+    height, force = gripper_lift.commands(gripper_lift.RUNS[0])
+    path = gripper_lift.lift(gripper_lift.Gripper(), height, force, duration=2.5)
+    commands = [height, force, force]
+    simulated = replayed(gripper_lift.MODEL, commands, 2.5, lambda d: d.qpos[[0, 5]] - [0.0, 0.03])
+    return simulated, path.state[10::10, [0, 2]]
+
+
+@pytest.mark.parametrize(
+    ("case", "tolerance"),
+    [(push_box_case, 1e-3), (ball_beam_case, 1e-3), (door_push_case, 5e-3), (gripper_lift_case, 1e-3)],
+)
+def test_equations_with_nominal_values_agree_with_mujoco(case, tolerance):
+    simulated, written = case()
+    assert np.sqrt(np.mean((simulated - written) ** 2, axis=0)).max() < tolerance
+
+
+def test_a_case_is_the_same_whenever_it_is_made():
+    first, second = (tossed_block.CASES[1].make() for _ in range(2))
+    for one, other in zip(first.motions, second.motions, strict=True):
+        for name, table in one.measured.items():
+            for column, values in table.columns.items():
+                np.testing.assert_array_equal(values, other.measured[name].columns[column])
+
+
+def test_a_turn_and_its_inverse_leave_a_vector():
+    half = radians(20)
+    q = np.array([np.cos(half), 0.0, np.sin(half), 0.0])
+    np.testing.assert_allclose(turned(conjugate(q), turned(q, np.array([1.0, 2.0, 3.0]))), [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(turned(q, np.array([1.0, 0.0, 0.0])), [np.cos(2 * half), 0.0, -np.sin(2 * half)])
