@@ -34,8 +34,10 @@ def longer_time_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel:
         base: The fitted model, whose predictions are those of its own time step.
         cfg: Settings.
     """
-    given = base.timestep
-    for factor in range(min(cfg.max_lengthening, int(_longest_step(base, cfg) / given + 1e-9)), 1, -1):
+    given, longest = base.timestep, _longest_step(base, cfg)
+    for factor in range(cfg.max_lengthening, 1, -1):
+        if factor * given > (1 + 1e-9) * longest:
+            continue
         longer = _with_time_step(base, factor * given)
         if _change(base, longer) <= cfg.max_error_of_longer:
             return _with_defects(longer, given)
