@@ -274,6 +274,8 @@ class TimeStepCfg:
     max_error_of_longer: Positive = 0.5
     """Change by such a longer step over the noise [-], beyond what initial states and the model's own parameters take
     up. Predictions are corrected for it; what remains is how it differs from one candidate to another."""
+    max_error_of_longer_in_contact: Positive = 0.2
+    """The same where bodies touch [-]: candidates differ in when contacts begin between two steps."""
     max_share_of_contact: Positive = 0.2
     """Longest such step over the shortest time constant of the model's contacts [-]: MuJoCo's contacts are no stiffer
     than two steps, and candidates may be up to twice and a half as stiff as the model."""

@@ -23,6 +23,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
 from concent_warp.diagnosis.result import FinerTimeStep
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
+from concent_warp.fit.effects.impacts import impacts
 from concent_warp.fit.effects.observation import TimeStepDefect, Window
 from concent_warp.fit.effects.robust import cauchy_weight
 
@@ -30,16 +31,23 @@ from concent_warp.fit.effects.robust import cauchy_weight
 def longer_time_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel:
     """Return a fitted model whose simulations take longer steps where that changes little, corrected for the change.
 
+    Where bodies in flight hit something they do not: when an impact begins between two steps is decided anew by each
+    candidate, and no correction holds for all.
+
     Args:
         base: The fitted model, whose predictions are those of its own time step.
         cfg: Settings.
     """
     given, longest = base.timestep, _longest_step(base, cfg)
+    smooth = all(w.smooth for w in base.windows)
+    if not smooth and _has_impacts(base):
+        return base
+    most = cfg.max_error_of_longer if smooth else cfg.max_error_of_longer_in_contact
     for factor in range(cfg.max_lengthening, 1, -1):
         if factor * given > (1 + 1e-9) * longest:
             continue
         longer = _with_time_step(base, factor * given)
-        if _change(base, longer) <= cfg.max_error_of_longer:
+        if _change(base, longer) <= most:
             return _with_defects(longer, given)
     return base
 
@@ -218,6 +226,13 @@ def _change(base: FittedModel, other: FittedModel) -> float:
     """
     change = [a - piece.residual for a, piece in zip(_residuals(other), base.fit.linear, strict=True)]
     return noise_ratio(np.concatenate(_without_own(base, _projected(base, change))))
+
+
+def _has_impacts(base: FittedModel) -> bool:
+    """Return whether a body that flew hits something in the motion of a fitted model."""
+    solver = base.solver()
+    courses = solver.p.courses(solver.trials(base.fit.values, base.fit.offsets))
+    return any(True for course in courses for _ in impacts(solver.p.compiled, course, base.cfg.observation))
 
 
 def _longest_step(base: FittedModel, cfg: TimeStepCfg) -> float:
