@@ -39,7 +39,13 @@ from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.impact_errors import stand
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
-from concent_warp.diagnosis.search.time_step import corrected, longer_time_step, may_be_step, renew_defects
+from concent_warp.diagnosis.search.time_step import (
+    corrected,
+    longer_time_step,
+    may_be_step,
+    renew_defects,
+    without_defects,
+)
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -223,7 +229,7 @@ class Procedure:
         found = []
         for one in followed:
             begun = [offset * w.spread for offset, w in zip(one.fit.offsets, given.windows, strict=True)]
-            plain = [replace(w, defect=None) for w in given.windows]
+            plain = without_defects(given).windows
             windows = with_scatter(one.delivered, plain, self.engine, observation, begun)
             more = [_directions(a) > _directions(b) for a, b in zip(windows, given.windows, strict=True)]
             if any(more):

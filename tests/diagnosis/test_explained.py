@@ -129,7 +129,7 @@ def test_a_search_ends_with_a_shorter_time_step_that_leaves_no_more_than_noise(m
 
 def test_a_model_that_leaves_no_more_than_noise_stays_as_given_where_no_effect_was_accepted(monkeypatch):
     for name in ("at_given_step", "without_nominal_values"):
-        monkeypatch.setattr(revision, name, lambda one: one)
+        monkeypatch.setattr(revision, name, lambda one, *_: one)
     for ratio, found, stays in (
         (1.02, [], True),
         (1.02, [finding("a", 0.5, accepted=False)], True),

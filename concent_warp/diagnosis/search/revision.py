@@ -160,7 +160,7 @@ class Revision:
         last, sentence = fitted[-1], "Open: whether {} beside the effects."
         if record.time_step is not None:
             context.progress("restoring the time step")
-            refit = partial(at_given_step, last, record.time_step.given, context.cfg.time_step)
+            refit = partial(at_given_step, last, given.timestep, context.cfg.time_step)
             restored = self._if_as_good(last, refit, sentence.format("a shorter time step is needed"))
             record.time_step = None if restored is not last else record.time_step
             last = restored

@@ -115,7 +115,7 @@ def _at_states_of_shorter_step(one: FittedModel, cfg: TimeStepCfg) -> FittedMode
     ]
     if not lost:
         return None
-    solver = _with_time_step(_without_defects(one), one.timestep).solver()
+    solver = _with_time_step(without_defects(one), one.timestep).solver()
     measured = [np.zeros_like(o) for o in one.fit.offsets]
     iterations = one.cfg.least_squares.initial_states.iterations
     found, starts, _ = solver.search.refined(one.fit.values, measured, lost, iterations)
@@ -131,7 +131,7 @@ def _defect(window: Window) -> np.ndarray:
 
 def at_given_step(last: FittedModel, timestep: float, cfg: TimeStepCfg) -> FittedModel:
     """Return a fitted model with the time step as given [s], all parameters fitted again."""
-    plain = _without_defects(last)
+    plain = without_defects(last)
     if plain.timestep > timestep:
         plain = _with_defects(plain, timestep)
     solver = plain.solver()
@@ -174,14 +174,14 @@ def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> boo
     return bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
 
 
-def _without_defects(one: FittedModel) -> FittedModel:
+def without_defects(one: FittedModel) -> FittedModel:
     """Return a model whose predictions are those of its own time step."""
     return replace(one, windows=tuple(replace(w, defect=None) for w in one.windows))
 
 
 def _with_defects(one: FittedModel, timestep: float) -> FittedModel:
     """Return a model with the defects of its motion against a shorter time step [s]; not fitted again."""
-    plain = _without_defects(one)
+    plain = without_defects(one)
     pairs = zip(plain.windows, _residuals(_with_time_step(plain, timestep)), _residuals(plain), strict=True)
     return replace(one, windows=tuple(replace(w, defect=TimeStepDefect(timestep, a - b)) for w, a, b in pairs))
 
@@ -213,7 +213,7 @@ def projected_residuals(base: FittedModel, other: FittedModel) -> list[np.ndarra
 
 def _division(base: FittedModel, cfg: TimeStepCfg) -> int:
     """Return into how many parts to divide the time step, so that its error is small beside the noise."""
-    error = 2 * _change(base, _with_time_step(_without_defects(base), base.timestep / 2))
+    error = 2 * _change(base, _with_time_step(without_defects(base), base.timestep / 2))
     if not np.isfinite(error):
         return 1
     return int(np.clip(np.ceil(error / cfg.max_error), 1, cfg.max_division))

@@ -129,9 +129,10 @@ def test_where_what_was_found_leaves_far_more_than_such_errors_there_is_no_secon
     for one in (given, last):
         one.fit, one.windows[0].spread = SimpleNamespace(offsets=[np.zeros(2)]), np.ones(2)
     monkeypatch.setattr(module, "flying_bodies", lambda _m: ["ball"])
+    monkeypatch.setattr(module, "without_defects", lambda one: one)
     monkeypatch.setattr(module, "with_scatter", lambda *_: ["scattered"])
     monkeypatch.setattr(module, "_directions", lambda w: int(w == "scattered"))
     monkeypatch.setattr(made, "_followed", lambda *_: [last])
-    monkeypatch.setattr(made, "_refitted", lambda model, _w: rough if model is given.model else "refitted")
+    monkeypatch.setattr(made, "_refitted", lambda model, *_: rough if model is given.model else "refitted")
     monkeypatch.setattr(made.context, "is_far_off", lambda one, _first: one is last or (far and one == "refitted"))
     assert made.baseline_with_errors_of_impacts(given, [given, last]) is (None if far else rough)

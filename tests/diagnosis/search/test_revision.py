@@ -26,7 +26,7 @@ def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at
         monkeypatch.setattr(
             revision,
             "at_given_step",
-            lambda one, errors=errors: node(1.0, errors, 1, nominal=len(one.model.effects) - 1),
+            lambda one, *_, errors=errors: node(1.0, errors, 1, nominal=len(one.model.effects) - 1),
         )
         monkeypatch.setattr(
             revision,

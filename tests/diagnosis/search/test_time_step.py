@@ -89,7 +89,7 @@ def test_predictions_with_defects_are_those_of_the_shorter_step_at_the_same_valu
     # Defects are replaced, not added to those that are there.
     twice = module._with_defects(corrected, FINE)
     np.testing.assert_allclose(residuals(twice), exact, atol=1e-9)
-    np.testing.assert_array_equal(residuals(module._without_defects(twice)), residuals(one))
+    np.testing.assert_array_equal(residuals(module.without_defects(twice)), residuals(one))
 
 
 def test_a_model_with_defects_has_their_time_step_and_is_handed_out_with_it(base, finer):
@@ -201,7 +201,7 @@ def test_an_effect_is_found_beside_a_step_that_is_too_long():
     given = fitted(recording)
     plain = fit_candidate(given, screen(given, effect_class("joint_damping")("hinge")))
     assert abs(plain.fit.values[-1] / DAMPING - 1) > 0.04
-    restored = at_given_step(added)
+    restored = at_given_step(added, TIMESTEP, CFG.time_step)
     assert restored.timestep == TIMESTEP
     assert all(w.defect is None for w in restored.windows)
     assert restored.fit.values[-1] == pytest.approx(plain.fit.values[-1], rel=0.02)
