@@ -16,6 +16,11 @@ from concent_warp.train.trials.evaluate import wilson
 Row = dict[str, Any]
 Score = Literal["right", "unsettled", "wrong"]
 NAME = "foreign"
+KEPT = (
+    "name", "machine", "kind", "accepted", "locked", "noise_stated", "verdict", "groups", "ratio", "unsettled", "error",
+    "seconds", "processor_seconds", "commit",
+)  # fmt: skip
+"""What the page's data keep of a result."""
 TITLES = {
     "null": "nothing hidden: no discrepancy",
     "single": "one effect: it alone",
@@ -78,7 +83,7 @@ def write(rows: Sequence[Row], host: str, total: int) -> None:
         host: Where they were measured, in words.
         total: Logs that there are.
     """
-    kept = [{k: v for k, v in row.items() if k != "effects"} for row in rows]
+    kept = [{key: row[key] for key in KEPT if key in row} for row in rows]
     write_data(NAME, {"host": host, "rows": kept, "total": total})
     write_page(NAME, page(rows, host, total))
 

@@ -157,14 +157,14 @@ def test_the_model_stays_as_given_where_accepted_effects_explain_less_than_a_fif
     assert found.verdict == "none_of_these"
     assert found.unexplained == pytest.approx(min((left**2 - 1) / 3, 1.0))
     assert (found.explains, found.changes_model) == (explains, explains)
-    assert found.model is (last.delivered if explains else given.model)
+    assert found.model is (last.delivered if explains else given.delivered)
     assert [f.name for f in found.accepted] == ["a"]
 
 
 def test_without_an_accepted_effect_the_model_is_as_given():
     given = node(3.0, name="given")
     found = procedure().conclude(given, [given], (), ())
-    assert (found.verdict, found.unexplained, found.model) == ("none_of_these", 1.0, given.model)
+    assert (found.verdict, found.unexplained, found.model) == ("none_of_these", 1.0, given.delivered)
     assert not found.changes_model
 
 

@@ -20,6 +20,7 @@ from concent_warp.diagnosis.search.time_step import (
     at_given_step,
     finding,
     finer_time_step,
+    longer_time_step,
     may_be_step,
     renew_defects,
 )
@@ -30,6 +31,7 @@ from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
+from tests.scenes.bouncing import bounced
 from tests.scenes.swinging import DAMPING, TIMESTEP, swung
 
 FINE = TIMESTEP / 10
@@ -244,3 +246,51 @@ def test_what_may_be_the_error_of_the_shorter_step_is_no_sign_that_something_is_
     too_long = replace(step, too_long=True)
     assert "shorten the step of the model further" in too_long.sentence
     assert too_long.to_json()["too_long"]
+
+
+def test_simulations_take_the_longest_steps_that_change_little_and_predict_what_the_given_ones_do():
+    given, limits = fitted(swung(damping=0.0, timestep=FINE), timestep=FINE), TimeStepCfg(max_error_of_longer=4.0)
+    found = longer_time_step(given, limits)
+    factor = round(simulated_steps(found) / FINE)
+    assert 1 < factor < limits.max_lengthening
+    assert (found.timestep, found.delivered.scene.model.opt.timestep) == (FINE, FINE)
+    np.testing.assert_allclose(residuals(found), residuals(given), atol=1e-9)
+    uncorrected = noise_ratio(residuals(module.without_defects(found)) - residuals(given))
+    assert uncorrected > 10 * noise_ratio(residuals(found, 0.3) - residuals(given, 0.3))
+    changes = [module._change(given, with_step(given, k * FINE)) for k in (factor, factor + 1)]
+    assert changes[0] <= limits.max_error_of_longer < changes[1]
+    for cfg in (TimeStepCfg(max_lengthening=1), TimeStepCfg(max_error_of_longer=1e-6)):
+        assert longer_time_step(given, cfg) is given
+
+
+def test_an_effect_that_is_found_with_longer_steps_has_the_values_of_the_given_ones():
+    given = fitted(swung(damping=DAMPING, timestep=FINE), timestep=FINE)
+    longer, values = longer_time_step(given, TimeStepCfg(max_error_of_longer=4.0)), []
+    for base in (given, longer):
+        candidate = fit_candidate(base, screen(base, effect_class("joint_damping")("hinge")))
+        values.append(renew_defects(add_candidate(base, candidate), CFG.time_step).fit.values[-1])
+    assert simulated_steps(longer) > FINE
+    assert values[1] == pytest.approx(values[0], rel=2e-3)
+    assert values[0] == pytest.approx(DAMPING, rel=0.02)
+
+
+def test_steps_stay_as_given_where_a_body_in_flight_hits_something():
+    recording, _ = bounced(2, off=0.0)
+    model = Model(Scene(recording.scene))
+    windows = observe(model, recording)
+    one = fit_baseline(model, windows, cut_blocks(windows))
+    assert not all(w.smooth for w in one.windows)
+    anyway = TimeStepCfg(max_error_of_longer_in_contact=1e3, max_share_of_contact=1e3)
+    assert longer_time_step(one, anyway) is one
+
+
+def test_steps_are_short_beside_the_time_constants_of_contacts():
+    text = """
+    <mujoco><option timestep="0.001"/><worldbody>
+      <geom type="plane" size="1 1 1" solref="{floor} 1"/>
+      <geom size="0.1" solref="0.001 1" contype="0" conaffinity="0"/>
+      <body pos="0 0 1"><freejoint/><geom size="0.1" solref="-1000 -10"/></body>
+    </worldbody></mujoco>"""
+    for floor, longest in ((0.02, 0.004), (0.01, 0.002), (-500.0, np.inf)):
+        one: Any = SimpleNamespace(model=Model(Scene(text.format(floor=floor))))
+        assert module._longest_step(one, CFG.time_step) == pytest.approx(longest)

@@ -22,6 +22,7 @@ from concent_warp.fit.effects.prediction import (
     PredictionCfg,
     SensorReader,
     SimulationRequest,
+    of_similar_length,
     turn,
 )
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -101,6 +102,27 @@ def test_the_time_that_was_simulated_counts_whole_steps(recording, windows):
     assert [c.qpos.shape for c in courses] == [(11, 1)] * 2
     assert courses[1].qpos[0, 0] - courses[0].qpos[0, 0] == pytest.approx(0.1)
     assert courses[0].size == 11 * 5 * 8
+
+
+def test_windows_that_differ_by_few_steps_are_simulated_in_one_call_the_longest_first():
+    steps = [50, 100, 99, 97, 30]
+    assert of_similar_length(range(5), steps, 4) == [[1, 2, 3], [0], [4]]
+    assert of_similar_length(range(5), steps, 3) == [[1, 2], [3], [0], [4]]
+    assert of_similar_length([4, 0], steps, 100) == [[0, 4]]
+    assert of_similar_length([1, 1, 2], steps, 0) == [[1, 1], [2]]
+    assert of_similar_length([], steps, 4) == []
+
+
+def test_what_is_simulated_beyond_a_window_is_left_out(recording, windows):
+    one, other = windows[0], replace(windows[1], end=windows[1].end - 0.02)
+    prediction = Prediction(drawing(recording), (), [one, other])
+    both = prediction.courses([SimulationRequest(0, NONE), SimulationRequest(1, NONE)])
+    for w, course in enumerate(both):
+        (alone,) = prediction.only([w]).courses([SimulationRequest(0, NONE)])
+        assert course.qpos.shape == alone.qpos.shape
+        assert course.size == alone.size
+        late = np.array([course.qpos.shape[0] * 0.005 + 0.02])
+        np.testing.assert_allclose(course.reader("angle", late), alone.reader("angle", late), atol=1e-12)
 
 
 def test_trials_of_several_windows_and_lengths_come_back_in_order(recording, windows):
