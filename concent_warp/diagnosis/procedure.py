@@ -336,8 +336,13 @@ class Procedure:
         return found
 
     def _with_longer_step(self, one: FittedModel) -> FittedModel:
-        """Return a fitted model whose simulations take longer steps where that changes little."""
+        """Return a fitted model whose simulations take longer steps where that changes little.
+
+        Where it is far off they do not: corrections about its motion mean little for that which was measured.
+        """
         context = self.context
+        if one.noise_ratio > context.cfg.search.far_ratio:
+            return one
         context.progress("trying longer time steps")
         unsettled = "Not tried: longer time steps."
         return context.budget.attempt(lambda: longer_time_step(one, context.cfg.time_step), one, unsettled)
@@ -496,7 +501,10 @@ class Procedure:
         cfg = self.context.cfg
         cfg = replace(cfg.experiment, seed=cfg.seed, observation=cfg.fits.observation)
         given = self.model.scene.model.opt.timestep
-        models = {name: replace(m, scene=m.scene.with_timestep(given)) for name, m in groups[0].items()}
+        models = {
+            name: m if m.scene.model.opt.timestep == given else replace(m, scene=m.scene.with_timestep(given))
+            for name, m in groups[0].items()
+        }
         return suggest_experiment(models, self.recording, cfg, engine=self.engine)
 
     def _failures(self, given: FittedModel) -> tuple[Mapping[str, Any], ...]:

@@ -41,6 +41,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
 
         concluded, renewed = [], []
         monkeypatch.setattr(made, "baseline", lambda nodes=nodes: nodes[0])
+        monkeypatch.setattr(module, "longer_time_step", lambda one, _cfg: one)
         monkeypatch.setattr(made.additions.finder, "find", find)
         monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
         monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
@@ -108,7 +109,7 @@ def test_the_answer_starts_with_the_model_as_given(monkeypatch):
     given, finer, added = node(3.0), node(1.2, timestep=FINER), node(1.0, timestep=FINER, effects=1)
     found = procedure().conclude(given, [finer, added], (), ())
     assert found.ratio == (30.0, 12.0, 10.0)
-    assert found.models == (given.model, finer.delivered, added.delivered)
+    assert found.models == (given.delivered, finer.delivered, added.delivered)
     assert procedure().conclude(given, [given], (), ()).ratio == (30.0,)
 
 
@@ -252,7 +253,7 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     assert [f.name for f in found.effects] == order
     assert found.groups == tuple(groups)
     assert (found.detectable, found.issues, found.seed) == (("size",), ("a gap",), 0)
-    assert [m.name for m in found.models] == [str(ratios[0]), *(f"delivered {r}" for r in ratios[1:])]
+    assert [m.name for m in found.models] == [f"delivered {r}" for r in ratios]
     assert (found.where, found.next_experiment) == ((), None)
     assert found.form_error == (pytest.approx(unexplained) if form_error else None)
     # Where much more than noise is left, no force of unknown form is needed to show that something is missing.
@@ -303,9 +304,9 @@ def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
     found = made.conclude(given, [given, last], (), ())
     assert (found.where, found.next_experiment, found.replayed) == (({"span": 1},), "experiment", said)
     limit = made.context.cfg.doubtful_replay
-    assert replays == [(given.model, last.delivered, RECORDING, last.windows, limit, "mujoco")]
+    assert replays == [(given.delivered, last.delivered, RECORDING, last.windows, limit, "mujoco")]
     (model, recording, cfg), more = asked[0]
-    assert (model.name, recording) == ("given", RECORDING)
+    assert (model.name, recording) == ("delivered given", RECORDING)
     assert cfg == made.context.cfg.failures
     assert more == {"engine": "mujoco", "windows": given.windows, "offsets": "o"}
     (models, recording, cfg), more = asked[1]
