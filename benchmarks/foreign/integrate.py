@@ -27,13 +27,13 @@ class Held(NamedTuple):
 @njit(cache=True)
 def coulomb(speed: float, level: float) -> float:
     """Return dry friction, which turns its sign over about 1 mrad/s or 1 mm/s."""
-    return level * np.tanh(speed / 1e-3)
+    return level * np.tanh(speed / CREEP)
 
 
 @njit(cache=True)
 def stribeck(speed: float, level: float, extra: float, fades: float) -> float:
     """Return dry friction that is larger out of rest, by an extra that fades with the speed."""
-    return (level + extra * np.exp(-((speed / fades) ** 2))) * np.tanh(speed / 1e-3)
+    return (level + extra * np.exp(-((speed / fades) ** 2))) * np.tanh(speed / CREEP)
 
 
 @njit(cache=True)

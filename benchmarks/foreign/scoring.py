@@ -32,8 +32,9 @@ ABOUT = """\
 simulated by equations of motion that are written here, machine by machine, with friction and contacts of their own
 form, and not by MuJoCo, Drake or Bullet. They were written by roboticists' rules without any diagnosis: which names
 count as right, and by how much masses, lengths, gains (0.3 to 2 %), friction and damping (up to 4 %) differ from the
-model, also where nothing is hidden, was fixed before. Sizes of hidden effects were set by the residuals that `concent
-compare` shows. Noise is stated in about half of the logs.
+model, also where nothing is hidden, was fixed before; lengths are exact where bodies touch or fly.
+Sizes of hidden effects were set by the residuals that `concent compare` shows. Noise is stated in about half of the
+logs.
 
 An answer is right where it names each hidden effect by a name that counts, alone or in a group of at most two, and
 nothing else; where nothing is hidden, if it says that nothing is missing; where the library lacks the cause, if it says

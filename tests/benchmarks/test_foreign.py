@@ -71,7 +71,7 @@ def test_a_log_is_read_back_as_it_was_written(tmp_path):
         assert demonstration.measured["q"].noise_std == pytest.approx(1e-3)
 
 
-def test_a_log_is_diagnosed_by_a_process_of_its_own_and_the_page_has_it(tmp_path, monkeypatch):
+def test_a_log_is_diagnosed_by_a_process_of_its_own_and_the_page_has_it(tmp_path):
     (case,) = [case for case in all_cases() if case.name == "hoist-null"]
     args = command.Args(names=(case.name,), out=tmp_path, cores=1)
     result = command.in_process(case, args, "0123456789ab")
@@ -84,7 +84,6 @@ def test_a_log_is_diagnosed_by_a_process_of_its_own_and_the_page_has_it(tmp_path
     assert set(KEPT) >= set(study.described(case)) - {"cause"}
     with pytest.raises(SystemExit, match="has no no_such"):
         command.main(command.Args(names=("no_such",)))
-    monkeypatch.setattr("sys.argv", ["foreign", "--report"])
     with pytest.raises(SystemExit, match="no results in"):
         command.main(command.Args(report=True, results=(tmp_path / "empty",)))
     assert json.loads((tmp_path / "hoist-null.json").read_text())["commit"] == "0123456789ab"
