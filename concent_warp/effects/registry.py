@@ -57,6 +57,7 @@ NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalInertia,
     nominal.NominalLength,
     nominal.NominalSize,
+    nominal.NominalArmature,
     nominal.NominalStiffness,
     nominal.NominalTendonStiffness,
     nominal.NominalDamping,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from concent_warp.effects.library.nominal import NominalMass
 from concent_warp.effects.registry import NOMINAL, effect_class, effect_classes
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
@@ -24,7 +25,8 @@ def test_masses_lengths_and_gains_are_scaled_and_nothing_else():
     plain = model.compile()
     heavy = model.add_effect("nominal_mass", ["fore"], {"mass[fore]": 1.01}).compile()
     np.testing.assert_allclose(heavy.body_mass, plain.body_mass * [1, 1, 1.01])
-    np.testing.assert_allclose(heavy.body_inertia[2], 1.01 * plain.body_inertia[2])
+    np.testing.assert_array_equal(heavy.body_inertia, plain.body_inertia)
+    assert NominalMass("fore").fields(plain) == ("body_mass",)
     slow = model.add_effect("nominal_inertia", ["fore"], {"inertia[fore]": 0.99}).compile()
     np.testing.assert_allclose(slow.body_inertia[2], 0.99 * plain.body_inertia[2])
     np.testing.assert_array_equal(slow.body_mass, plain.body_mass)
@@ -35,6 +37,26 @@ def test_masses_lengths_and_gains_are_scaled_and_nothing_else():
     strong = model.add_effect("nominal_gain", ["elbow"], {"gain[elbow]": 1.02}).compile()
     np.testing.assert_allclose(strong.actuator_gainprm[:, 0], [12, 6.12])
     np.testing.assert_allclose(strong.actuator_biasprm[:, 2], [-0.6, -0.255])
+
+
+def test_mass_and_inertia_of_a_free_body_are_off_together():
+    model = Model(Scene(BALL))
+    plain = model.compile()
+    body = plain.body(1).name
+    heavy = model.add_effect("nominal_mass", [body], {f"mass[{body}]": 0.99}).compile()
+    np.testing.assert_allclose(heavy.body_mass[1], 0.99 * plain.body_mass[1])
+    np.testing.assert_allclose(heavy.body_inertia[1], 0.99 * plain.body_inertia[1])
+
+
+def test_the_armature_of_joints_that_have_any_is_scaled():
+    model = Model(Scene(PUSHER.replace('damping="0.05"/>', 'damping="0.05" armature="0.01"/>', 1)))
+    (kind,) = (k for k in NOMINAL if k.name == "nominal_armature")
+    assert kind.targets(model.compile()) == (("shoulder",),)
+    assert kind.targets(Model(Scene(PUSHER)).compile()) == ()
+    heavy = model.add_effect(kind.name, ["shoulder"], {"armature[shoulder]": 1.02}).compile()
+    np.testing.assert_allclose(heavy.dof_armature, [0.0102, 0.0])
+    np.testing.assert_array_equal(heavy.dof_damping, model.compile().dof_damping)
+    assert kind.is_within(effect_class("armature")("shoulder"))
 
 
 def test_friction_of_joints_that_have_any_is_scaled_about_all_their_axes():

@@ -166,10 +166,49 @@ def without_bounded(model: Model, pieces: Sequence[Linear]) -> Sequence[Linear]:
     """
     if not any(added.effect.nominal for added in model.effects):
         return pieces
-    plain, free = replace(model, effects=()).compile(), []
+    mask = np.ones(pieces[0].jacobian.shape[1])
+    directions = _ways_out(model)
+    mask[: len(directions)] = directions == 0
+    return [replace(piece, jacobian=piece.jacobian * mask) for piece in pieces]
+
+
+def without_outward(base: FittedModel, pieces: Sequence[Linear]) -> Sequence[Linear]:
+    """Return sensitivities of 0 to nominal values at their bounds that a linear step would lead beyond these.
+
+    Beside a candidate a nominal value may leave the bound to which the lack of it has led. Those that a step of all
+    parameters moves outward are held one after another, until none is (active set method: Nocedal and Wright,
+    "Numerical Optimization", section 16.5).
+
+    Args:
+        base: The fitted model.
+        pieces: Residuals and sensitivities by window, to parameters of a candidate, too, behind those of the model.
+    """
+    ways = _ways_out(base.model)
+    if not ways.any():
+        return pieces
+    size, prior = pieces[0].jacobian.shape[1], base.cfg.least_squares.prior
+    ways = np.pad(ways, (0, size - len(ways)))
+    sums = block_sums(pieces, base.blocks, base.limit)
+    normal, slope = sums.normal.sum(axis=0) + np.eye(size) / prior**2, sums.slope.sum(axis=0)
+    slope[: len(base.fit.values)] += base.solver().prior(base.fit.values) / prior
+    free = np.ones(size, dtype=bool)
+    while True:
+        move = np.zeros(size)
+        move[free] = -np.linalg.pinv(normal[np.ix_(free, free)], hermitian=True) @ slope[free]
+        outward = free & (ways * move > 0)
+        if not outward.any():
+            return [replace(piece, jacobian=piece.jacobian * free) for piece in pieces]
+        free &= ~outward
+
+
+def _ways_out(model: Model) -> np.ndarray:
+    """Return for each parameter of a model's effects which way leads out of its bounds, shape (P,): 1, -1 or 0.
+
+    It is 0 where the value is not at a bound, and for all that are no nominal values.
+    """
+    plain, found = replace(model, effects=()).compile(), []
     for added in model.effects:
         for p, value in zip(added.effect.parameters(plain), added.values, strict=True):
-            free.append(not (added.effect.nominal and FittedParameter.within(p, value, 0.0).at_bound))
-    mask = np.ones(pieces[0].jacobian.shape[1])
-    mask[: len(free)] = free
-    return [replace(piece, jacobian=piece.jacobian * mask) for piece in pieces]
+            at_bound = added.effect.nominal and FittedParameter.within(p, value, 0.0).at_bound
+            found.append((1 if value > p.null else -1) if at_bound else 0)
+    return np.array(found, dtype=int)

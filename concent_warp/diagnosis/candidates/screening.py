@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import without_bounded
+from concent_warp.diagnosis.candidates.baseline import without_outward
 from concent_warp.diagnosis.candidates.candidate import FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.effects.effect import Effect
@@ -46,15 +46,16 @@ def screen(
     known = base.fit.linear if taken_over else ()
     # The residual is the baseline's own; at a start off the null value it is another.
     linear = solver.linearise(at, base.fit.offsets, known, residual_known=same)
-    projected = without_bounded(base.model, base.projected(replace(base.fit, linear=linear)))
-    pieces = with_residuals(projected, base.pieces)
+    projected = base.projected(replace(base.fit, linear=linear))
+    pieces = tuple(without_outward(base, with_residuals(projected, base.pieces)))
     gain = _linear_gain(base, pieces, base.pieces, base.errors)
     far, zero = _are_far(base, cfg), tuple(np.zeros_like(o) for o in base.fit.offsets)
     if far:
         known = (at_measured or linear_at_measured_states(base, cfg)) if taken_over else ()
         linear = solver.linearise(at, zero, known, residual_known=same)
-        there = without_bounded(base.model, base.projected(replace(base.fit, linear=linear, offsets=zero)))
+        there = base.projected(replace(base.fit, linear=linear, offsets=zero))
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
+        there, plain = without_outward(base, there), without_outward(base, plain)
         before = base.held_out(plain).own()
         gain = max(gain, _linear_gain(base, there, plain, before))
     scanned_gain, start = _scan(solver, base, values, base.fit.offsets, cfg)

@@ -6,6 +6,7 @@ before it are tried: what one of them explains needs no further effect.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +21,7 @@ from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
 from concent_warp.diagnosis.search.holding import hold
-from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values
+from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values, stays_within
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import finer_time_step, renew_defects
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
@@ -76,13 +77,15 @@ class Additions:
             if finer is not None and self._is_decisive(fitted[-1], finer):
                 fitted = self._adopt(fitted, finer)
                 continue
-            bounded, before = None, record.time_step
+            bounded, before = None, record.constants
             if not effects_alone and (found := self._with_nominal(fitted, finer, first)) is not None:
+                if not step:
+                    record.held_first = len(record.holding)
                 if step >= cfg.max_additions or not self._is_at_bounds(found[-1]):
                     fitted = found
                     continue
                 # Something larger may be missing: an effect that explains more comes first.
-                bounded, record.time_step, before = found, before, record.time_step
+                bounded, record.constants, before = found, before, record.constants
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
             if step and self._is_futile(fitted[-1]):
@@ -98,19 +101,23 @@ class Additions:
             except TimeUpError:
                 context.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
                 if bounded is not None:
-                    fitted, record.time_step = bounded, before
+                    fitted, record.constants = bounded, before
                 break
             detectable = detectable or smallest
             if best is not None and not effects_alone and (held := self._held_instead(fitted[-1])) is not None:
                 record.forget(*recorded)
-                fitted, record.time_step, record.held_first = [*fitted[:-1], held], before, len(record.holding)
+                fitted, record.time_step, record.held_first = (
+                    [*fitted[:-1], held],
+                    before.time_step,
+                    len(record.holding),
+                )
                 continue
             equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
             if bounded is not None and (
                 best is None or not leaves_more(errors_like(bounded[-1], fitted[-1]), best.errors, cfg.search)
             ):
                 record.forget(*recorded)
-                fitted, record.time_step = bounded, before
+                fitted, record.constants = bounded, before
                 continue
             if finer is not None and errors_like(finer, fitted[-1]).sum() <= equal:
                 record.forget(*recorded)
@@ -245,11 +252,31 @@ class Additions:
         leave no more than an error in its formula, which they take up before another effect does.
         """
         enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
-        both = None if finer is None else self.context.nominal(finer, enough)
-        plain = self.context.nominal(fitted[-1], enough)
+        both = None if finer is None else self._nominal(finer, enough)
+        plain = self._nominal(fitted[-1], enough)
         if finer is not None and both is not None and (plain is None or self._needs_step(plain, both)):
             return [*self._adopt(fitted, finer)[:-1], both]
         return None if plain is None else [*fitted[:-1], plain]
+
+    def _nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None) -> FittedModel | None:
+        """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
+
+        Errors of nominal values may hide those of the simulator's constants, and nominal values stand in for these:
+        where they leave more than noise, friction that holds is tried beside them.
+
+        Args:
+            one: The fitted model.
+            enough: Whether a model with values at their bounds leaves little enough.
+        """
+        context, holding = self.context, self.context.record.holding
+        found = context.nominal_fit(one)
+        if found is None:
+            return None
+        held = self.with_holding(found)
+        if stays_within(held, context.cfg.nominal, enough):
+            return held
+        context.record.holding = holding
+        return found if stays_within(found, context.cfg.nominal, enough) else None
 
     def _needs_step(self, plain: FittedModel, finer: FittedModel) -> bool:
         """Return whether a model explains more with a shorter time step, which nominal values may stand in for."""

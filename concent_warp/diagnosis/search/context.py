@@ -6,12 +6,13 @@ Settings, tasks, time and record of the search, and whether a fitted model expla
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, least_ratio
-from concent_warp.diagnosis.search.nominal_values import nominal_effects, with_nominal_values
+from concent_warp.diagnosis.search.nominal_values import nominal_effects, stays_within, with_nominal_values
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.diagnosis.time_budget import TimeBudget
@@ -125,17 +126,26 @@ class SearchContext:
         without = last.ratio**2 / max(1 - min(gains), 1e-12)
         return last.ratio**2 - 1 > self.cfg.max_remainder * (without - 1)
 
-    def nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None = None) -> FittedModel | None:
+    def nominal(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
+
+        It is None, too, where one runs to its bound and more than noise is left.
 
         Args:
             one: The fitted model.
-            enough: Whether a model with values at their bounds leaves little enough.
+        """
+        found = self.nominal_fit(one)
+        return found if found is not None and stays_within(found, self.cfg.nominal) else None
+
+    def nominal_fit(self, one: FittedModel) -> FittedModel | None:
+        """Return a fitted model with nominal values up to their bounds, None where that explains nothing more.
+
+        Args:
+            one: The fitted model.
         """
         if not self.cfg.nominal.enabled or nominal_effects(one.model):
             return None
         self.progress("fitting nominal values within their tolerance")
         unsettled = "Open: whether nominal values are off within their tolerance."
-        return self.budget.attempt(
-            lambda: with_nominal_values(one, self.cfg.nominal, self.least_gain(one), enough), None, unsettled
-        )
+        fit = partial(with_nominal_values, one, self.cfg.nominal, self.least_gain(one))
+        return self.budget.attempt(fit, None, unsettled)

@@ -19,19 +19,15 @@ from concent_warp.fit.effects.robust import huber_weight
 from concent_warp.model import Model
 
 
-def with_nominal_values(
-    base: FittedModel, cfg: NominalCfg, min_gain: float, enough: Callable[[FittedModel], bool] | None = None
-) -> FittedModel | None:
+def with_nominal_values(base: FittedModel, cfg: NominalCfg, min_gain: float) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
-    It is None where none shows, where they remove too little of the held-out error, or where one runs to its bound and
-    more than noise is left: then something larger is missing.
+    It is None where none shows, or where they remove too little of the held-out error.
 
     Args:
         base: The fitted model.
         cfg: Settings.
         min_gain: Share of the held-out error that they must remove [-].
-        enough: Whether a model with values at their bounds leaves little enough; by default `NominalCfg.bounded_ratio`.
     """
     visible, promised = _visible(base, cfg)
     if not visible or promised < cfg.promised_share * min_gain:
@@ -44,15 +40,24 @@ def with_nominal_values(
     # Within the tolerance residuals are in proportion to the values: no polish is needed.
     fit = solver.fit(start, base.fit.offsets, base.fit.starts)
     found = fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
-    bounded = [
-        FittedParameter.within(p, v, 0.0) for p, v in zip(solver.p.parameters[:nominal], fit.values, strict=False)
-    ]
-    little = found.ratio <= cfg.bounded_ratio or (enough is not None and enough(found))
-    inside = little or not any(p.at_bound for p in bounded)
     sums, prior = block_sums(found.pieces, found.blocks, base.limit), base.cfg.least_squares.prior
     # Here the values themselves are judged: each fold is predicted from those of the others.
     errors = HeldOut(sums, found.blocks, prior).of_fit()
-    return found if inside and errors.sum() <= (1 - min_gain) * base.errors.sum() else None
+    return found if errors.sum() <= (1 - min_gain) * base.errors.sum() else None
+
+
+def stays_within(found: FittedModel, cfg: NominalCfg, enough: Callable[[FittedModel], bool] | None = None) -> bool:
+    """Return whether none of a model's nominal values runs to its bound while more than noise is left.
+
+    Something larger is missing where one does.
+
+    Args:
+        found: The fitted model with nominal values.
+        cfg: Settings.
+        enough: Whether a model with values at their bounds leaves little enough; by default `NominalCfg.bounded_ratio`.
+    """
+    little = found.ratio <= cfg.bounded_ratio or (enough is not None and enough(found))
+    return little or not has_bounded_nominal_values(found.model)
 
 
 def nominal_effects(model: Model) -> list[int]:

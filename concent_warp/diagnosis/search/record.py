@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,14 @@ from concent_warp.diagnosis.result import Finding, FinerTimeStep, HoldingFrictio
 from concent_warp.diagnosis.search.reconsider import Rival
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
+
+
+class Constants(NamedTuple):
+    """Constants of the simulator that are other ones than as given; see `SearchRecord`."""
+
+    time_step: FinerTimeStep | None
+    holding: tuple[HoldingFriction, ...]
+    held_first: int
 
 
 @dataclass
@@ -50,6 +59,15 @@ class SearchRecord:
     """How many of these hold in the model that effects are added to."""
     beside_impacts: bool = False
     """Whether errors of impacts count as noise."""
+
+    @property
+    def constants(self) -> Constants:
+        """Which constants of the simulator are other ones than as given."""
+        return Constants(self.time_step, self.holding, self.held_first)
+
+    @constants.setter
+    def constants(self, value: Constants) -> None:
+        self.time_step, self.holding, self.held_first = value
 
     def copy(self) -> SearchRecord:
         """Return a copy that does not change with this one."""

@@ -59,10 +59,17 @@ class NominalBodyValue(Effect):
 
 
 class NominalMass(NominalBodyValue):
-    """Mass and inertia of bodies within their tolerance."""
+    """Mass of bodies within their tolerance.
+
+    Of free bodies, whose shape and density say both, the inertia is off by as much. That of links is a nominal value of
+    its own (`NominalInertia`): a catalogue or a CAD model states each, and they need not be off together.
+    """
 
     name = "nominal_mass"
-    summary = "Mass and inertia are the model's times a factor within the tolerance of nominal values."
+    summary = (
+        "The mass is the model's times a factor within the tolerance of nominal values; that of free bodies with the "
+        "inertia."
+    )
     signature = "residual force in proportion to acceleration and gravity"
     confusions = ("mass",)
     part_of = "mass"
@@ -72,15 +79,18 @@ class NominalMass(NominalBodyValue):
         return nominal_parameters("mass", self.target)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
-        """Mass and inertia, and the share of the weight that is compensated."""
-        return mass_fields(m, self.ids(m))
+        """Mass, inertia of free bodies, and the share of the weight that is compensated."""
+        ids = self.ids(m)
+        scaled = mass_fields(m, ids)
+        return scaled if np.isin(ids, free_bodies(m)).any() else tuple(f for f in scaled if f != "body_inertia")
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Scale both; a drive goes on compensating the weight that it knows."""
+        """Scale them; a drive goes on compensating the weight that it knows."""
         ids = self.ids(m)
         m.body_mass[ids] *= values
         m.body_gravcomp[ids] /= values
-        m.body_inertia[ids] *= values[:, None]
+        free = np.isin(ids, free_bodies(m))
+        m.body_inertia[ids[free]] *= values[free, None]
 
 
 class NominalLinkValue(NominalBodyValue):
@@ -196,12 +206,14 @@ class NominalStiffness(JointEffect):
 
 
 class NominalBearingValue(BearingEffect):
-    """A nominal value of the bearings of joints that a model has."""
+    """A nominal value of joints that a model has, one a joint, of rotors or bearings."""
 
     nominal = True
     source = "tolerance of nominal values"
     field: ClassVar[str]
     """Field of the compiled model with a value a degree of freedom."""
+    tolerance: ClassVar[float] = FRICTION_TOLERANCE
+    """Standard deviation of the value over the model's [-]."""
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -213,7 +225,7 @@ class NominalBearingValue(BearingEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor a joint."""
-        return nominal_parameters(self.part_of.removeprefix("joint_"), self.target, FRICTION_TOLERANCE)
+        return nominal_parameters(self.part_of.removeprefix("joint_"), self.target, self.tolerance)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """See `field`."""
@@ -245,6 +257,18 @@ class NominalFriction(NominalBearingValue):
     confusions = ("joint_friction", "stribeck_friction", "load_friction")
     part_of = "joint_friction"
     field = "dof_frictionloss"
+
+
+class NominalArmature(NominalBearingValue):
+    """Inertia of rotors that a model has in its joints, within its tolerance."""
+
+    name = "nominal_armature"
+    summary = "The armature of the joint is the model's times a factor within the tolerance of nominal values."
+    signature = "residual torque in proportion to acceleration"
+    confusions = ("armature", "inertia")
+    part_of = "armature"
+    field = "dof_armature"
+    tolerance = TOLERANCE
 
 
 class NominalTendonStiffness(Effect):

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.candidates.baseline import fit_baseline, held_out_errors, refit_without_effect
+from concent_warp.diagnosis.candidates.baseline import (
+    fit_baseline,
+    held_out_errors,
+    refit_without_effect,
+    without_outward,
+)
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.effects.library.joints import JointDamping, JointFriction
 from concent_warp.effects.library.nominal import NominalGain
+from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, cut_blocks
+from concent_warp.fit.effects.least_squares import Linear
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -89,6 +97,29 @@ def test_a_candidate_promises_nothing_that_a_nominal_value_beyond_its_bound_woul
     assert base.ratio > 3
     assert screen(base, ActuatorGain("servo")).expected_gain > 0.9
     assert screen(base, JointFriction("hinge")).expected_gain < 0.1
+
+
+def test_a_nominal_value_may_leave_the_bound_to_which_the_lack_of_a_candidate_has_led():
+    """The residual is 2 a + 3 b: a value with the sensitivity a rises alone and beside b, and falls beside a + b."""
+    a, b = np.eye(2).repeat(20, axis=1)
+    place = SimpleNamespace(start=0.0, end=4.0, number=0, clock=np.arange(40) / 10)
+    for bound, value, beside, free in (
+        ("high", 1.02, [], False),
+        ("high", 1.02, [b], False),
+        ("high", 1.02, [a + b], True),
+        ("low", 0.98, [], True),
+        ("low", 0.98, [a + b], False),
+        ("inside", 1.01, [], True),
+    ):
+        model = Model(Scene(swing_scene(kp=1.1))).add_effect("nominal_gain", ["servo"], {"gain[servo]": value})
+        pieces = [Linear(-2 * a - 3 * b, np.stack([a, *beside], axis=1))]
+        base = SimpleNamespace(
+            model=model, blocks=cut_blocks([place]), limit=np.inf, cfg=EffectSolverCfg(),
+            fit=SimpleNamespace(values=[value]), solver=lambda: SimpleNamespace(prior=np.zeros_like),
+        )  # fmt: skip
+        (found,) = without_outward(base, pieces)  # pyright: ignore[reportArgumentType]
+        assert bool(found.jacobian[:, 0].any()) is free, bound
+        np.testing.assert_array_equal(found.jacobian[:, 1:], pieces[0].jacobian[:, 1:])
 
 
 def test_an_effect_at_its_null_value_gains_nothing_over_the_model_without_it():

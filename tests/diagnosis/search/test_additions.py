@@ -195,18 +195,49 @@ def test_over_short_windows_no_further_effect_is_tried_on_an_error_of_form(monke
 def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
     given, after, asked = node(5.0), node(2.0, effects=1), []
 
-    def nominal(one, cfg, min_gain, enough):
+    def nominal(one, cfg, min_gain):
         # Far from the noise they must explain a fifth; as near as an error of form leaves, what an effect must.
         assert (cfg, min_gain) == (made.context.cfg.nominal, 0.2 if one is given else 0.04)
-        asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
         return one
 
+    def within(_found, _cfg, enough=None):
+        asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
+        return True
+
     monkeypatch.setattr(context, "with_nominal_values", nominal)
+    monkeypatch.setattr(additions, "stays_within", within)
     made = procedure(min_gain=0.04)
+    monkeypatch.setattr(made.additions, "with_holding", lambda one: one)
     made.additions._with_nominal([given], None, given)
     made.additions._with_nominal([given, after], None, given)
     # 5.2 % and 9.3 % of the discrepancy.
     assert asked == [None, [True, False]]
+
+
+@pytest.mark.parametrize(
+    ("held", "inside", "left", "holding"),
+    [
+        ("held", ("held",), "held", ("joints",)),
+        ("held", (), None, ()),
+        ("held", ("values",), "values", ()),  # what holds has led a value to its bound
+        ("values", ("values",), "values", ()),  # nothing that holds explains more
+    ],
+)
+def test_friction_that_holds_is_tried_beside_nominal_values(monkeypatch, held, inside, left, holding):
+    made, given = procedure(), node(9.0, 900.0)
+    nodes = {"values": node(1.7, 60.0, nominal=1), "held": node(1.0, 20.0, nominal=1)}
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: nodes["values"])
+    monkeypatch.setattr(additions, "stays_within", lambda found, *_: found in [nodes[name] for name in inside])
+
+    def with_holding(one):
+        assert one is nodes["values"]
+        made.record.holding = ("joints",) if held == "held" else ()
+        return nodes[held]
+
+    monkeypatch.setattr(made.additions, "with_holding", with_holding)
+    found = made.additions._with_nominal([given], None, given)
+    assert found == (None if left is None else [nodes[left]])
+    assert made.record.holding == holding
 
 
 @pytest.mark.parametrize(
@@ -361,6 +392,7 @@ def test_over_short_windows_nothing_is_added_to_an_effect_beside_which_nominal_v
         return found
 
     monkeypatch.setattr(context, "with_nominal_values", with_nominal_values)
+    monkeypatch.setattr(context, "stays_within", lambda *_: True)
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
     monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
     monkeypatch.setattr(made.additions.finder, "find", one_after_the_other(made, nodes))

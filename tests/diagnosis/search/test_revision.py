@@ -320,6 +320,7 @@ def test_an_only_effect_that_may_be_at_its_null_value_leaves_the_model_as_given(
         made, given, reduced = procedure(), node(ratio), node(ratio, 150.0)
         instead = None if nominal is None else node(nominal, 104.0, nominal=1)
         monkeypatch.setattr(context, "with_nominal_values", lambda *_, instead=instead: instead)
+        monkeypatch.setattr(context, "stays_within", lambda *_: True)
         made.record.findings = [replace(finding("a", 0.1), parameters=(OPEN,))]
         made.record.groups, made.record.hypotheses = [("a",)], [{"a": 1}]
         after = made.revision.remove_unestablished([given, node(1.0, 100.0, effects=1)], [reduced], [False])

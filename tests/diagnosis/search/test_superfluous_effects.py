@@ -113,6 +113,7 @@ def test_an_effect_is_superfluous_where_nominal_values_explain_as_much(monkeypat
             return instead if instead is not None else pytest.fail("the effect is superfluous without them")
 
         monkeypatch.setattr(context, "with_nominal_values", nominal)
+        monkeypatch.setattr(context, "stays_within", lambda *_: True)
         after = made.revision.remove_superfluous([node(3), node(2), last])
         assert made.record.groups == ([("b",)] if dropped else [("a",), ("b",)])
         assert after[-1] is (last if not dropped else reduced if instead is None else instead)
