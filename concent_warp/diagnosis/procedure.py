@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,8 @@ from concent_warp.diagnosis.search.context import (
     SearchContext,
 )
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
-from concent_warp.diagnosis.search.impact_errors import stand
+from concent_warp.diagnosis.search.form_error import error_of_own_friction, said_of_own_friction
+from concent_warp.diagnosis.search.impact_errors import stand, with_errors_of_impacts
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
 from concent_warp.diagnosis.search.time_step import (
@@ -44,17 +46,14 @@ from concent_warp.diagnosis.search.time_step import (
     longer_time_step,
     may_be_step,
     renew_defects,
-    without_defects,
 )
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
-from concent_warp.fit.effects.impacts import flying_bodies
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import channel_noises, has_touchable_free_body, observe
 from concent_warp.fit.effects.prediction import Prediction
-from concent_warp.fit.effects.scatter import with_scatter
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.parallel import limit_simulations
@@ -142,7 +141,8 @@ class Procedure:
         if (explained and not added and not self._may_be_hidden()) or context.budget.cut:
             return given, fitted, detectable
         left_open = "Open: what is missing where errors of impacts are allowed for."
-        rough = context.budget.attempt(lambda: self.baseline_with_errors_of_impacts(given, fitted), None, left_open)
+        begin = partial(with_errors_of_impacts, context, given, fitted, self._refitted)
+        rough = context.budget.attempt(begin, None, left_open)
         if rough is None:
             return given, fitted, detectable
         stands = not added
@@ -208,52 +208,6 @@ class Procedure:
         context.progress("refitting the effects beside errors of impacts")
         refitted = self._refitted(fitted[-1].model, rough.windows)
         return all(stand(rough, refitted, len(accepted), context.noise_factors, context.cfg))
-
-    def baseline_with_errors_of_impacts(self, given: FittedModel, fitted: Sequence[FittedModel]) -> FittedModel | None:
-        """Return the model as given where errors of impacts count as noise; None where there are no impacts.
-
-        It is None, too, where the model is far off, with what was found as well, if anything, and beside such errors.
-
-        Args:
-            given: The model as given.
-            fitted: The same and after each addition.
-        """
-        cfg = self.context.cfg
-        observation = replace(cfg.fits.observation, impact_error=cfg.search.impact_error)
-        flies = bool(flying_bodies(self.model.compile()))
-        if not (observation.impact_error and flies) or len(fitted[-1].windows) != len(given.windows):
-            return None
-        followed = self._followed(given, fitted[-1])
-        if given.noise_ratio > cfg.search.far_ratio and all(one is given for one in followed):
-            return None
-        found = []
-        for one in followed:
-            begun = [offset * w.spread for offset, w in zip(one.fit.offsets, given.windows, strict=True)]
-            plain = without_defects(given).windows
-            windows = with_scatter(one.delivered, plain, self.engine, observation, begun)
-            more = [_directions(a) > _directions(b) for a, b in zip(windows, given.windows, strict=True)]
-            if any(more):
-                found.append(self._refitted(given.model, windows, given.timestep))
-        rough, far = min(found, key=lambda one: one.ratio, default=None), self.context.is_far_off
-        if rough is not None and far(fitted[-1], given):
-            return None if far(self._refitted(fitted[-1].model, rough.windows), rough) else rough
-        return rough
-
-    def _followed(self, given: FittedModel, last: FittedModel) -> list[FittedModel]:
-        """Return the models whose impacts may be those that were measured.
-
-        One has the effects that were added; the other one not those of objects, which may stand for errors of impacts.
-
-        Args:
-            given: The model as given.
-            last: The same with all additions.
-        """
-        accepted, effects = self.record.accepted(), list(last.model.effects)
-        owned = len(effects) - len(accepted)
-        kept = [added for k, added in enumerate(effects[owned:]) if accepted[k].family != "objects"]
-        if not kept or len(kept) == len(accepted):
-            return [given, last] if accepted and not kept else [last if accepted else given]
-        return [self._refitted(replace(last.model, effects=(*effects[:owned], *kept)), given.windows), last]
 
     def search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given and after each addition, and the detectable sizes of all effects."""
@@ -415,6 +369,8 @@ class Procedure:
         share = float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0))
         unexplained = share if added or begun.ratio > cfg.adequate_ratio else 0.0
         adequate = context.explains(last, begun, added=added) and not context.takes_up_parts(last)
+        own_error = None if adequate or added else self._error_of_own_friction(last)
+        adequate |= own_error is not None
         form_error = None
         if added and is_lacking(last, context.noise_factors, cfg) and context.is_form_error(last, begun):
             form_error = unexplained
@@ -464,7 +420,7 @@ class Procedure:
             ratio=(given.noise_ratio, *(one.noise_ratio for one in after)),
             detectable=detectable,
             next_experiment=experiment,
-            issues=(*issues, *self._said_of_impacts()),
+            issues=(*issues, *self._said_of_impacts(), *said_of_own_friction(own_error)),
             models=(given.delivered, *(one.delivered for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
@@ -483,6 +439,13 @@ class Procedure:
         """Return what a replay in one piece says of the last model."""
         limit = self.context.cfg.doubtful_replay
         return replayed(given.delivered, last.delivered, self.recording, last.windows, limit, self.engine)
+
+    def _error_of_own_friction(self, last: FittedModel) -> float | None:
+        """Return what a model without added effects leaves where that may be the error of its friction, else None."""
+        error = partial(error_of_own_friction, last, self.context.cfg, self.context.results)
+        return self.context.budget.attempt(
+            error, None, "Open: whether what is left is an error of the model's friction."
+        )
 
     def _said_of_impacts(self) -> tuple[str, ...]:
         """Return a sentence on what the answer leaves of impacts, none where it leaves nothing."""
@@ -520,8 +483,3 @@ class Procedure:
                 offsets=given.fit.offsets,
             )
         )
-
-
-def _directions(window: Window) -> int:
-    """Return in how many directions predictions of a window scatter."""
-    return 0 if window.scatter is None else window.scatter.deviations.shape[1]

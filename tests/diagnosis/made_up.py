@@ -56,10 +56,14 @@ def node(
 
 
 def procedure(**changes: Any) -> Any:
-    """Return a procedure, with settings; it replays nothing without `explain`: made-up models cannot be simulated."""
+    """Return a procedure, with settings; it replays nothing without `explain`: made-up models cannot be simulated.
+
+    Nor have they friction of their own.
+    """
     made = Procedure(MODEL, RECORDING, replace(DiagnoseCfg(jobs=1, explain=False), **changes))
     made.seen = []  # pyright: ignore[reportAttributeAccessIssue]
     made.context.runner = TaskRunner(1, lambda share, text: made.seen.append((share, text)))  # pyright: ignore
+    made._error_of_own_friction = lambda _: None  # pyright: ignore
     if not made.context.cfg.explain:
         made._replayed = lambda *_: None  # pyright: ignore
     return made

@@ -95,6 +95,19 @@ def test_a_force_of_no_known_form_decides_where_no_effect_explains_enough_of_lit
     assert (concluded.unexplained, concluded.explains) == ((1.0, False) if verdict == "none_of_these" else (0.0, True))
 
 
+@pytest.mark.parametrize(("error", "refused", "verdict"), [(0.02, True, "none_needed"), (None, True, "none_of_these")])
+def test_what_may_be_an_error_of_the_models_own_friction_needs_no_effect(monkeypatch, error, refused, verdict):
+    force_is(monkeypatch, lambda *_: None)
+    made, given, asked = procedure(), node(9.0), []
+    made._error_of_own_friction = lambda one: asked.append(one) or error
+    made.record.findings = [finding("a", 0.1, accepted=not refused)]
+    last = node(1.4, nominal=1)
+    concluded = made.conclude(given, [last], (), ())
+    assert (concluded.verdict, asked) == (verdict, [last])
+    said = [sentence for sentence in concluded.issues if "2 % of what the model's own dry friction does" in sentence]
+    assert bool(said) is (error is not None)
+
+
 def test_where_what_is_left_may_be_an_error_of_a_formula_one_more_effect_is_tried(monkeypatch):
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
     monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)

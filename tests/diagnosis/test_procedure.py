@@ -42,6 +42,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         concluded, renewed = [], []
         monkeypatch.setattr(made, "baseline", lambda nodes=nodes: nodes[0])
         monkeypatch.setattr(module, "longer_time_step", lambda one, _cfg: one)
+        monkeypatch.setattr(module, "with_errors_of_impacts", lambda *_: None)  # nothing touches anything
         monkeypatch.setattr(made.additions.finder, "find", find)
         monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
         monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
@@ -87,6 +88,7 @@ def test_over_short_windows_time_step_and_nominal_values_stay_as_given(monkeypat
     made, coarse, given = procedure(), [node(5.0), node(3.0), node(2.0)], node(30.0)
     # Beside an effect they are fitted to see whether they explain the rest, and are not kept.
     monkeypatch.setattr(context, "with_nominal_values", lambda one, *_: coarse[2] if one in coarse[1:] else given)
+    monkeypatch.setattr(context, "stays_within", lambda *_: True)
     monkeypatch.setattr(
         made.additions.finder, "find", lambda _base, step, **_: (coarse[step + 1] if step < 2 else None, ("size",))
     )

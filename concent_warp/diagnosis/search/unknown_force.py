@@ -61,6 +61,17 @@ def unknown_force(nodes: Sequence[FittedModel], cfg: DiagnoseCfg, results: Resul
     return beside
 
 
+def force_beside(last: FittedModel, cfg: DiagnoseCfg, results: Results) -> UnknownForceFound | None:
+    """Return the force of no known form that explains most of what a model leaves, None where none is significant.
+
+    Args:
+        last: The fitted model.
+        cfg: DiagnoseCfg.
+        results: See `Results`.
+    """
+    return _best_force(last, None, max(*discrepancies(last, last), cfg.unknown_force.min_gain), cfg, results)
+
+
 def _best_force(
     base: FittedModel, rival: FittedModel | None, lacked: float, cfg: DiagnoseCfg, results: Results
 ) -> UnknownForceFound | None:

@@ -102,7 +102,7 @@ def test_a_candidate_promises_nothing_that_a_nominal_value_beyond_its_bound_woul
 def test_a_nominal_value_may_leave_the_bound_to_which_the_lack_of_a_candidate_has_led():
     """The residual is 2 a + 3 b: a value with the sensitivity a rises alone and beside b, and falls beside a + b."""
     a, b = np.eye(2).repeat(20, axis=1)
-    place = SimpleNamespace(start=0.0, end=4.0, number=0, clock=np.arange(40) / 10)
+    of_rows = Blocks((np.arange(40) // 5,), *(np.arange(8) % 4, np.zeros(8, int), np.arange(8.0), np.arange(8.0) + 1))
     for bound, value, beside, free in (
         ("high", 1.02, [], False),
         ("high", 1.02, [b], False),
@@ -114,7 +114,7 @@ def test_a_nominal_value_may_leave_the_bound_to_which_the_lack_of_a_candidate_ha
         model = Model(Scene(swing_scene(kp=1.1))).add_effect("nominal_gain", ["servo"], {"gain[servo]": value})
         pieces = [Linear(-2 * a - 3 * b, np.stack([a, *beside], axis=1))]
         base = SimpleNamespace(
-            model=model, blocks=cut_blocks([place]), limit=np.inf, cfg=EffectSolverCfg(),
+            model=model, blocks=of_rows, limit=np.inf, cfg=EffectSolverCfg(),
             fit=SimpleNamespace(values=[value]), solver=lambda: SimpleNamespace(prior=np.zeros_like),
         )  # fmt: skip
         (found,) = without_outward(base, pieces)  # pyright: ignore[reportArgumentType]

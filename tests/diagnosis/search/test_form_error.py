@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,21 @@ from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.form_error import flexible_correction
+from concent_warp.diagnosis.result import UnknownForceFound
+from concent_warp.diagnosis.search import form_error
+from concent_warp.diagnosis.search.form_error import (
+    error_of_own_friction,
+    flexible_correction,
+    said_of_own_friction,
+)
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
 from concent_warp.diagnosis.tasks import run_tasks
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
-from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from tests.scenes.swinging import DAMPING, drawing, swing_scene, swung, windows_of
 
 CFG = DiagnoseCfg(jobs=1, explain=False)
 RECORDING = swung(damping=DAMPING / 50)
@@ -105,3 +114,33 @@ def test_a_remainder_that_a_correction_takes_away_is_an_error_of_form(lacking, w
     assert made.context.is_form_error(with_friction, lacking)
     made.context.cfg = replace(made.context.cfg, max_form_error=left - 0.05)
     assert not made.context.is_form_error(with_friction, lacking)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "friction", "explained", "found"),
+    [
+        (1.5, 20.0, 0.0, 0.056),  # sqrt(1.25) x noise beside 20
+        (1.5, 20.0, 0.27, 0.056),  # of 2.25, half of 1.25
+        (1.5, 20.0, 0.29, None),
+        (1.5, 11.0, 0.0, None),  # more than a tenth
+        (2.1, 50.0, 0.0, None),  # too much beside the noise
+        (1.0, 50.0, 0.0, None),
+        (1.5, None, 0.0, None),  # no friction at all
+    ],
+)
+def test_what_is_little_beside_the_models_own_friction_may_be_its_error(
+    monkeypatch, with_friction, ratio, friction, explained, found
+):
+    model = (
+        with_friction.model
+        if friction is None
+        else Model(Scene(swing_scene().replace("damping=", "frictionloss='0.01' damping=")))
+    )
+    one = SimpleNamespace(model=model, ratio=ratio)
+    columns = np.full((100, 1), 0.05 * (friction or 1.0))
+    monkeypatch.setattr(form_error, "nominal_sensitivities", lambda _: SimpleNamespace(of=lambda _kinds: columns))
+    force = UnknownForceFound("a force", explained, 0.01, 1.0) if explained else None
+    monkeypatch.setattr(form_error, "force_beside", lambda *_: force)
+    share = error_of_own_friction(one, CFG, results)  # pyright: ignore[reportArgumentType]
+    assert share == (None if found is None else pytest.approx(found, rel=0.01))
+    assert bool(said_of_own_friction(share)) is (found is not None)

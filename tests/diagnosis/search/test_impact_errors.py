@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis import procedure as module
+from concent_warp.diagnosis import procedure as procedure_module
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.impact_errors import stand
+from concent_warp.diagnosis.search import impact_errors as module
+from concent_warp.diagnosis.search.impact_errors import stand, with_errors_of_impacts
 from tests.diagnosis.made_up import finding, node, procedure
 
 
@@ -72,8 +74,8 @@ def test_an_effect_of_any_family_but_contacts_must_stand_where_errors_of_impacts
 )
 def test_what_was_refused_is_looked_for_beside_errors_of_impacts(monkeypatch, p, gain, found, answer):
     made, nodes = procedure(), {"given": node(1.0), "rough": node(1.0), "added": node(0.98, effects=1)}
-    monkeypatch.setattr(module, "has_touchable_free_body", lambda _m: True)
-    monkeypatch.setattr(made, "baseline_with_errors_of_impacts", lambda *_: nodes["rough"])
+    monkeypatch.setattr(procedure_module, "has_touchable_free_body", lambda _m: True)
+    monkeypatch.setattr(procedure_module, "with_errors_of_impacts", lambda *_: nodes["rough"])
 
     def search(base):
         if base is nodes["given"]:
@@ -106,7 +108,7 @@ def test_beside_a_small_effect_that_stands_a_single_one_beside_errors_of_impacts
 ):
     made, given, rough = procedure(), node(1.05), node(1.0)
     after = [node(0.98, effects=k + 1) for k in range(2)]
-    monkeypatch.setattr(made, "baseline_with_errors_of_impacts", lambda *_: rough)
+    monkeypatch.setattr(procedure_module, "with_errors_of_impacts", lambda *_: rough)
     monkeypatch.setattr(made, "_stand", lambda *_: first)
 
     def search(base):
@@ -128,11 +130,15 @@ def test_where_what_was_found_leaves_far_more_than_such_errors_there_is_no_secon
     made, given, last, rough = procedure(), node(3.0), node(2.0, effects=1), node(2.5)
     for one in (given, last):
         one.fit, one.windows[0].spread = SimpleNamespace(offsets=[np.zeros(2)]), np.ones(2)
+        one.engine, one.model.compile = "mujoco", lambda: None
     monkeypatch.setattr(module, "flying_bodies", lambda _m: ["ball"])
     monkeypatch.setattr(module, "without_defects", lambda one: one)
     monkeypatch.setattr(module, "with_scatter", lambda *_: ["scattered"])
     monkeypatch.setattr(module, "_directions", lambda w: int(w == "scattered"))
-    monkeypatch.setattr(made, "_followed", lambda *_: [last])
-    monkeypatch.setattr(made, "_refitted", lambda model, *_: rough if model is given.model else "refitted")
+    monkeypatch.setattr(module, "_followed", lambda *_: [last])
+
+    def refit(model, *_) -> Any:
+        return rough if model is given.model else "refitted"
+
     monkeypatch.setattr(made.context, "is_far_off", lambda one, _first: one is last or (far and one == "refitted"))
-    assert made.baseline_with_errors_of_impacts(given, [given, last]) is (None if far else rough)
+    assert with_errors_of_impacts(made.context, given, [given, last], refit) is (None if far else rough)
