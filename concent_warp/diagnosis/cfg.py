@@ -129,8 +129,8 @@ class SearchCfg:
     """Length of the windows of the multiple-shooting initialisation [s]. Empirical: impacts need 0.1-0.3 s, free motion
     allows more."""
     shooting_min_gain: float = 0.5
-    """Gain over the best one above which a candidate is initialised by multiple shooting, if no candidate explains the
-    data [-]. Empirical."""
+    """Gain over the best one above which a candidate is initialised by multiple shooting, or continued as windows grow,
+    if no candidate explains the data [-]. Empirical."""
     shooting_fits: int = 3
     """Most candidates initialised that way. Empirical."""
     window_growth: Annotated[float, Bounds(1, above_low=True)] = 1.5

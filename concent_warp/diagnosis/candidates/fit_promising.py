@@ -306,7 +306,7 @@ class CandidateFits:
         )
         least = max(self.cfg.min_gain, search.shooting_min_gain * ranked[0][0]) if ranked else 0.0
         chosen = [(s, c) for share, s, c in ranked if share > least][: search.shooting_fits]
-        tasks = [(base, c, search) for _, c in chosen]
+        tasks = [(base, c, search, self.cfg.min_gain, self._best()) for _, c in chosen]
         added, places = 0, {id(s): k for k, s in enumerate(self.fitted)}  # fits from other processes have copies
         for (s, _), c in zip(chosen, self.runner.run_in_time(continue_fit, tasks, "growing windows"), strict=True):
             if c is None:

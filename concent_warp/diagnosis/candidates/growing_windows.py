@@ -18,6 +18,7 @@ from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.least_squares import Fit, Solver
 from concent_warp.fit.effects.observation import Window, first_part
 
 
@@ -45,13 +46,25 @@ def fit_first_parts(near: FittedModel, effect: Effect, cfg: SearchCfg, least: fl
     return fit_candidate(near, screened) if screened.expected_gain > least else None
 
 
-def continue_fit(base: FittedModel, found: FittedCandidate, cfg: SearchCfg) -> FittedCandidate:
+def continue_fit(
+    base: FittedModel,
+    found: FittedCandidate,
+    cfg: SearchCfg,
+    least: float = 0.0,
+    best: FittedCandidate | None = None,
+) -> FittedCandidate | None:
     """Return a candidate fitted over the model's windows, continued from a fit over the first parts of these.
+
+    It is None where a fit on the way gains too little over the model, whose initial states are those of whole windows,
+    or far less than the best candidate: it has ended in a local minimum, and longer windows have more of them.
 
     Args:
         base: The fitted model.
         found: The fit over the first parts, see `fit_first_parts`.
         cfg: Settings.
+        least: Share of the model's cost over parts of the windows that a fit over these must remove.
+        best: The best fit over whole windows; over such parts a fit must remove `SearchCfg.shooting_min_gain` of what
+            this one does.
     """
     length, longest = cfg.shooting_window, max(w.end - w.start for w in base.windows)
     values, offsets = found.fit.values, found.fit.offsets
@@ -62,4 +75,17 @@ def continue_fit(base: FittedModel, found: FittedCandidate, cfg: SearchCfg) -> F
         fit = solver.fit(values, *solver.fit_initial_states(values, offsets))
         if length >= longest:
             return fitted_candidate(base, found.effect, solver, fit)
+        before = _cost_over(base.solver(windows=windows), base.fit)
+        needed = least
+        if best is not None:
+            of_best = 1 - _cost_over(candidate_solver(base, best.effect, windows), best.fit) / before
+            needed = max(least, cfg.shooting_min_gain * of_best)
+        if fit.cost > (1 - needed) * before:
+            return None
         values, offsets = fit.values, fit.offsets
+
+
+def _cost_over(solver: Solver, fit: Fit) -> float:
+    """Return the cost of a fit over the windows of a solver, first parts of those it was fitted to."""
+    residuals = solver.p.residuals(solver.trials(fit.values, fit.offsets))
+    return solver.cost(residuals, fit.offsets, fit.values)

@@ -3,17 +3,20 @@
 Contacts make the cost rough, so that derivatives at a point neither lead to its minimum nor give its width. The cost is
 therefore evaluated some standard deviations away along the profile of each parameter: the other parameters at their
 conditional optimum to first order, the initial states fitted again (Bates and Watts, Nonlinear Regression Analysis and
-Its Applications, 1988, chapter 6). A point with a lower cost restarts the fit. Residuals that are correlated make costs
-differ by more than independent ones do: falls are judged in units of this overdispersion, as quasi-likelihoods are
-(McCullagh and Nelder, Generalized Linear Models, 1989, chapter 9). Where the cost rises by less than its roughness,
-points farther away follow. In the end a parabola through the farthest points gives the width, the offset of the
-minimum, and the variance that the roughness adds.
+Its Applications, 1988, chapter 6). A point with a lower cost restarts the fit, before the profiles of further
+parameters are evaluated: these would be other ones after it. Residuals that are correlated make costs differ by more
+than independent ones do: falls are judged in units of this overdispersion, as quasi-likelihoods are (McCullagh and
+Nelder, Generalized Linear Models, 1989, chapter 9). Where the cost rises by less than its roughness, points farther
+away follow. In the end a parabola through the farthest points gives the width, the offset of the minimum, and the
+variance that the roughness adds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
@@ -112,20 +115,24 @@ def profile_point(
 def _profile(
     base: FittedModel, c: FittedCandidate, runner: TaskRunner, cfg: ProfileLikelihoodCfg, *, restarts: bool
 ) -> list[ProfilePoint]:
-    """Return points on the profile of each parameter, farther away where needed, until a lower one restarts the fit."""
+    """Return points on the profile of each parameter, farther away where needed, until a lower one restarts the fit.
+
+    Both sides of a parameter are evaluated together, one parameter after the other.
+    """
     points: list[ProfilePoint] = []
     for _ in range(1 + cfg.max_extensions):
-        distances = _next_distances(base, c, points, cfg)
+        distances, first = _next_distances(base, c, points, cfg), not points
         if not distances:
             break
-        tasks = [(base, c, *each, cfg) for each in distances]
-        found = runner.run_in_time(profile_point, tasks, "profile likelihood")
-        finished = [s for s in found if s is not None]
-        if not points and len(finished) < len(found):
-            raise TimeUpError("the profile likelihood was not evaluated on both sides in the time given")
-        points += finished
-        if len(finished) < len(found) or (restarts and _lower(c, points, cfg) is not None):
-            break
+        for _, each in groupby(distances, key=itemgetter(0)):
+            tasks = [(base, c, *at, cfg) for at in each]
+            found = runner.run_in_time(profile_point, tasks, "profile likelihood")
+            finished = [s for s in found if s is not None]
+            if first and len(finished) < len(found):
+                raise TimeUpError("the profile likelihood was not evaluated on both sides in the time given")
+            points += finished
+            if len(finished) < len(found) or (restarts and _lower(c, points, cfg) is not None):
+                return points
     return points
 
 

@@ -124,6 +124,13 @@ class Fit:
     """Simulated time [s]."""
     polished: bool = False
     """Whether a thorough polish ended here, so that another one finds nothing."""
+    searched: np.ndarray | None = None
+    """Parameters, shape (P,), at which a polish searched initial states from the measured ones last; None for none."""
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether a polish searched initial states from the measured ones at these very parameters."""
+        return self.searched is not None and np.array_equal(self.searched, self.values)
 
 
 @dataclass(frozen=True)
@@ -182,7 +189,8 @@ class Solver:
         """Return a fit continued with initial states fitted anew, from where they are and from the measured ones.
 
         Initial states that compensate for a wrong parameter keep it wrong: therefore the parameters take steps after
-        each of which the initial states are fitted anew.
+        each of which the initial states are fitted anew. From the measured ones they are not where a polish has done so
+        at the same parameters.
 
         Args:
             fit: The fit.
@@ -198,10 +206,10 @@ class Solver:
             return self._polish_together(fit, thorough=thorough)
         measured, best = [np.zeros_like(o) for o in fit.offsets], fit
         if not stuck:
-            fresh = self.improve_initial_states(fit, [measured])
+            fresh = self.improve_initial_states(fit, [] if fit.is_searched else [measured])
             # If none was better, steps that failed with initial states fitted anew would fail again.
             refits = None if fresh.cost < (1 - cfg.min_gain) * fit.cost else 0
-            best = self.fit(fresh.values, fresh.offsets, fresh.starts, refits=refits)
+            best = replace(self.fit(fresh.values, fresh.offsets, fresh.starts, refits=refits), searched=fit.values)
         noise, min_gain = (0.0, cfg.min_thorough_gain) if thorough else (cfg.noise_ratio, cfg.min_gain)
         for _ in range(cfg.polish_steps if len(fit.values) else 0):
             size = np.mean(np.concatenate([window.residual for window in best.linear]) ** 2)
@@ -253,7 +261,8 @@ class Solver:
     def _fit_at(self, fit: Fit, values: np.ndarray, first: Sequence[int], noise: float) -> Fit:
         """Return a fit at other values, initial states fitted anew; unchanged if the cost of `first` windows rises."""
         measured = [np.zeros_like(o) for o in fit.offsets]
-        there = self.improve_initial_states(replace(fit, values=values), [measured], noise, first, fresh=False)
+        moved = replace(fit, values=values, searched=values)
+        there = self.improve_initial_states(moved, [measured], noise, first, fresh=False)
         limit = huber_limit([window.residual for window in fit.linear], self.cfg.robust)
         before, after = (
             sum(start_cost(f.linear[w].residual, f.offsets[w], limit, self.cfg.robust) for w in first)
@@ -526,8 +535,8 @@ class Solver:
 
         A step uses the derivatives by the initial states as computed last. Where the cost falls by less than
         `predicted_share` of the prediction, the initial states are fitted anew at the new parameters before the step is
-        judged. Where no step lowers the cost by more than `tolerance`, the first one counts that does with the limit of
-        Huber's loss at this point.
+        judged, unless all parameters stay. Where no step lowers the cost by more than `tolerance`, the first one counts
+        that does with the limit of Huber's loss at this point.
         """
         cfg, held = self.cfg, None
         for _ in range(cfg.max_damping_trials):
@@ -547,7 +556,7 @@ class Solver:
             if cost < state.cost and (as_predicted or not state.refits):
                 lowered = max(damping / cfg.damping_decrease, cfg.min_damping)
                 return replace(state, values=values, offsets=offsets, cost=cost), lowered
-            if state.refits:
+            if state.refits and not np.array_equal(values, state.values):
                 begin = state.offsets if cost > cfg.restart_ratio * state.cost else offsets
                 refitted, starts = self.fit_initial_states(values, begin, cfg.refit_iterations, state.starts)
                 again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values, state.limit)

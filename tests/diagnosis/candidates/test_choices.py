@@ -422,7 +422,8 @@ def growing(monkeypatch, near: float, gains: dict[str, float]) -> tuple[list[str
     continued: list[str] = []
     parts = base_of(ratio=near)
 
-    def continue_fit(_base: Any, found: Any, _cfg: Any) -> Any:
+    def continue_fit(_base: Any, found: Any, _cfg: Any, least: float, best: Any) -> Any:
+        assert (least, best.name) == (DiagnoseCfg().min_gain, "a")
         continued.append(found.name)
         return replace(found, gain=found.gain + 0.1, cost=10.0)
 

@@ -70,10 +70,23 @@ def test_what_the_first_parts_show_is_continued_to_whole_windows(base):
     first = fit_first_parts(near, effect, cfg, 0.05)
     assert first is not None
     found = continue_fit(base, first, cfg)
+    assert found is not None
     assert found.fit.cost < 0.5 * at_once.fit.cost
     assert found.fit.values[0] == pytest.approx(SCALE, rel=0.05)
     assert found.ratio < 1.15
     assert fit_first_parts(near, effect_class("mass")("ball"), cfg, 0.05) is None
+
+
+def test_what_gains_too_little_over_parts_of_windows_is_not_continued(base):
+    effect, cfg = effect_class("length_scale")("ball"), SearchCfg()
+    first = fit_first_parts(baseline_of_first_parts(base, cfg.shooting_window), effect, cfg, 0.05)
+    assert first is not None
+    found = continue_fit(base, first, cfg, 0.05)
+    assert found is not None
+    assert continue_fit(base, first, cfg, 0.99) is None
+    assert continue_fit(base, first, cfg, 0.05, found) is not None
+    # Less than a multiple of what the best one gains there.
+    assert continue_fit(base, first, replace(cfg, shooting_min_gain=1.5), 0.05, found) is None
 
 
 def test_the_first_part_of_a_window_has_its_first_readings(base):

@@ -14,6 +14,7 @@ from concent_warp.diagnosis.candidates.profile_likelihood import (
     _farthest,
     _line_search,
     _lower,
+    _profile,
     _roughness,
     refine_by_profile,
 )
@@ -128,3 +129,22 @@ def test_a_profile_restarts_from_lower_costs_a_few_times(monkeypatch):
     assert (still[0].cost, still[1]) == (100.0, 1)
     none: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner())
     assert none[1] == 0
+
+
+def test_a_lower_cost_restarts_before_further_parameters_are_evaluated(monkeypatch):
+    asked: list[tuple[int, float]] = []
+    costs = {(0, -2.0): 101.0, (0, 2.0): 90.0, (1, -2.0): 101.0, (1, 2.0): 101.0}
+
+    def evaluate(_base, _c, parameter, distance, _cfg):
+        asked.append((parameter, distance))
+        return point(distance, costs[parameter, distance], 2.0, parameter)
+
+    monkeypatch.setattr(profile_likelihood, "_next_distances", lambda _b, _c, points, _cfg: [] if points else [*costs])
+    monkeypatch.setattr(profile_likelihood, "profile_point", evaluate)
+    cfg, c = ProfileLikelihoodCfg(), made("c", 0.5, 100.0)
+    found = _profile(ANY, c, TaskRunner(), cfg, restarts=True)
+    assert [s.cost for s in found] == [101.0, 90.0]
+    assert asked == [(0, -2.0), (0, 2.0)]
+    assert len(_profile(ANY, c, TaskRunner(), cfg, restarts=False)) == 4
+    costs[0, 2.0] = 101.0
+    assert len(_profile(ANY, c, TaskRunner(), cfg, restarts=True)) == 4
