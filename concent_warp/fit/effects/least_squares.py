@@ -650,10 +650,19 @@ class Solver:
         return move, [-(s[:, size] + s[:, :size] @ move) for s in parts]
 
 
+LEAST_SHARE = 1e-3
+"""Part of a sensitivity that changes of the initial state leave, over the whole, up to which it may count as none [-]:
+as large are errors of finite differences. The bias of a cart's position on a level rail is such a parameter."""
+LEAST_CHANGE = 0.1
+"""RMS of that part, in units of noise, up to which it counts as none then [-]: ten scales, as far as the parameter's
+prior reaches, are no more than noise."""
+
+
 def projected(fit: Fit, cfg: RobustLossCfg | None = None) -> list[Linear]:
     """Return residuals and sensitivities with the initial states eliminated, window by window.
 
-    They are those parts that no change of the initial state within its prior can explain.
+    They are those parts that no change of the initial state within its prior can explain; a sensitivity that such a
+    change explains but for `LEAST_SHARE` and `LEAST_CHANGE` is 0.
 
     Args:
         fit: The fit.
@@ -667,5 +676,8 @@ def projected(fit: Fit, cfg: RobustLossCfg | None = None) -> list[Linear]:
         inner = a.T @ both
         inner[:, -1] += near * o
         rest = both - a @ np.linalg.solve(m, inner)
-        found.append(replace(window, jacobian=rest[:, :-1], residual=rest[:, -1]))
+        jacobian, whole = rest[:, :-1], np.linalg.norm(window.jacobian, axis=0)
+        left = np.linalg.norm(jacobian, axis=0)
+        determined = (left > LEAST_SHARE * whole) | (left > LEAST_CHANGE * np.sqrt(len(jacobian)))
+        found.append(replace(window, jacobian=jacobian * determined, residual=rest[:, -1]))
     return found

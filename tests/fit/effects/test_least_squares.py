@@ -140,6 +140,20 @@ def test_what_an_initial_state_can_take_up_is_projected_out():
     np.testing.assert_allclose(found.jacobian, 2 * rest, atol=1e-2)
 
 
+@pytest.mark.parametrize(("size", "left"), [(1e-2, 0.0), (1.0, 2.0), (0.06, 0.12)])
+def test_a_sensitivity_that_an_initial_state_takes_up_but_for_rounding_is_none(size, left):
+    rng = np.random.default_rng(0)
+    start, rest = rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
+    rest -= start @ np.linalg.lstsq(start, rest, rcond=None)[0]
+    rest *= size / np.sqrt(np.mean(rest**2))
+    whole = 100.0 * start[:, :1]
+    piece = Linear(rest[:, 0], np.hstack([2 * rest + whole, rest]))
+    fit = Fit(np.zeros(2), (np.zeros(2),), 0.0, (piece,), (1e3 * start,), True, 0.0)
+    (found,) = projected(fit)
+    # The second one is as small, and nothing but what no initial state explains.
+    np.testing.assert_allclose(np.sqrt(np.mean(found.jacobian**2, axis=0)), [left, size], rtol=1e-2)
+
+
 def test_the_step_of_an_initial_state_is_that_of_ridge_regression():
     rng = np.random.default_rng(1)
     a, r, o = rng.normal(size=(20, 2)), 0.1 * rng.normal(size=20), np.array([0.5, -4.0])
