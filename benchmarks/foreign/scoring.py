@@ -40,8 +40,8 @@ An answer is right where it names each hidden effect by a name that counts, alon
 nothing else; where nothing is hidden, if it says that nothing is missing; where the library lacks the cause, if it says
 `none_of_these`. What is not settled in its time counts as wrong.
 
-A half of the machines, chosen by a hash of their names, is locked: their logs are diagnosed once, and no rule of the
-method was chosen by looking at their answers. Of the development logs 25 had been diagnosed once before, which showed a
+A half of the machines, chosen by a hash of their names, is locked: no rule of the method was chosen by looking at their
+answers, which are counted and not read. Of the development logs 25 had been diagnosed once before, which showed a
 crash; no rule came from them either. Square brackets have Wilson's 95 % intervals over logs; logs of a machine
 are alike, so that they are too narrow.
 """
