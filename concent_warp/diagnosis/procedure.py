@@ -141,7 +141,7 @@ class Procedure:
         if (explained and not added and not self._may_be_hidden()) or context.budget.cut:
             return given, fitted, detectable
         left_open = "Open: what is missing where errors of impacts are allowed for."
-        begin = partial(with_errors_of_impacts, context, given, fitted, self._refitted)
+        begin = partial(self.baseline_with_errors_of_impacts, given, fitted)
         rough = context.budget.attempt(begin, None, left_open)
         if rough is None:
             return given, fitted, detectable
@@ -208,6 +208,10 @@ class Procedure:
         context.progress("refitting the effects beside errors of impacts")
         refitted = self._refitted(fitted[-1].model, rough.windows)
         return all(stand(rough, refitted, len(accepted), context.noise_factors, context.cfg))
+
+    def baseline_with_errors_of_impacts(self, given: FittedModel, fitted: Sequence[FittedModel]) -> FittedModel | None:
+        """Return the model as given where errors of impacts count as noise, see `with_errors_of_impacts`."""
+        return with_errors_of_impacts(self.context, given, fitted, self._refitted)
 
     def search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given and after each addition, and the detectable sizes of all effects."""
