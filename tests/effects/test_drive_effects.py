@@ -85,6 +85,17 @@ def test_saturated_drive_accelerates_by_its_limit():
     assert cart.qvel[-1, 0] == pytest.approx(0.2 * 5.0 / MASS, rel=1e-6)
 
 
+@pytest.mark.parametrize("drive", ['joint="rail" gear="40"', 'joint="rail" gear="-40"', 'tendon="belt" gear="8"'])
+def test_a_limit_is_that_of_the_force_behind_the_gear(drive):
+    tendon = '<tendon><fixed name="belt"><joint joint="rail" coef="-5"/></fixed></tendon>'
+    xml = CART.replace("<actuator>", f"{tendon}<actuator>").replace(
+        'joint="rail"/></actuator>', f"{drive}/></actuator>"
+    )
+    assert drive in xml
+    limit = world(xml, ActuatorSaturation("drive"), 6.0).compile().actuator_forcerange
+    np.testing.assert_allclose(limit, [[-0.15, 0.15]])
+
+
 def test_saturation_keeps_a_limit_that_the_model_has():
     xml = CART.replace('joint="rail"/></actuator>', 'joint="rail" forcerange="-2 2"/></actuator>')
     m = world(xml, ActuatorSaturation("drive"), 3.0).compile()

@@ -102,7 +102,12 @@ def test_saturation_keeps_what_is_tighter_and_prepares_limits_far_away():
     m = world(TWO).add(ActuatorSaturation("a", "b")).compile()
     np.testing.assert_array_equal(m.actuator_forcerange[:2], [[-7, 4], [-1e6, 1e6]])
     assert m.actuator_forcelimited.tolist() == [1, 1, 0]
-    for limit, expected in ((5.0, [[-5, 4], [-5, 5]]), (3.0, [[-3, 3]] * 2), (np.inf, [[-7, 4], [-1e6, 1e6]])):
+    # The second one has a gear of 2: MuJoCo's force is that before it.
+    for limit, expected in (
+        (5.0, [[-5, 4], [-2.5, 2.5]]),
+        (3.0, [[-3, 3], [-1.5, 1.5]]),
+        (np.inf, [[-7, 4], [-1e6, 1e6]]),
+    ):
         tight = world(TWO).add(ActuatorSaturation("a", "b"), [limit]).compile()
         np.testing.assert_array_equal(tight.actuator_forcerange[:2], expected)
     empty = TWO.replace('forcerange="-7 4"', 'forcerange="0 0" forcelimited="false"')

@@ -204,7 +204,7 @@ class ActuatorSaturation(DriveEffect):
     """A drive whose force has a lower limit than the model's."""
 
     name = "actuator_saturation"
-    summary = "The drive's force does not exceed a limit."
+    summary = "The drive's force, behind its gear, does not exceed a limit."
     source = f"MuJoCo's force range ({MUJOCO})"
     signature = "residuals only where much torque is commanded: slow start, late arrival"
     confusions = ("actuator_gain", "actuator_lag")
@@ -224,7 +224,7 @@ class ActuatorSaturation(DriveEffect):
                 actuator.forcerange = [-self.FREE, self.FREE]
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """Return one limit for all actuators of the target, as a share of the largest typical torque of each."""
+        """Return one limit for all actuators of the target, on the joint; its scale is the largest typical torque."""
         joints = np.array([driven_joints(m, a)[0] for a in self.ids(m)])
         top = float(np.max(20 * m.dof_M0[dof_of(m, joints)]))
         scan = tuple((top * np.geomspace(0.05, 20.0, 36)).tolist())  # a limit shows in a narrow range only
@@ -236,11 +236,24 @@ class ActuatorSaturation(DriveEffect):
         return ("actuator_forcerange",)
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Set the limits, those that the model has already kept."""
+        """Set the limits, those that the model has already kept: MuJoCo's force is that before the gear."""
         ids = self.ids(m)
-        limit = min(float(values[0]), self.FREE)
+        limit = np.minimum(float(values[0]) / np.array([lever(m, int(a)) for a in ids]), self.FREE)
         m.actuator_forcerange[ids, 0] = np.maximum(m.actuator_forcerange[ids, 0], -limit)
         m.actuator_forcerange[ids, 1] = np.minimum(m.actuator_forcerange[ids, 1], limit)
+
+
+def lever(m: mujoco.MjModel, actuator: int) -> float:
+    """Return the force on the first joint that an actuator drives over the actuator's own force, without sign.
+
+    It is the gear's ratio, of a fixed tendon times its coefficient there; 1 where the actuator drives no joint.
+    """
+    joints, gear = driven_joints(m, actuator), abs(float(m.actuator_gear[actuator, 0]))
+    if joints and m.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_TENDON):
+        first = m.tendon_adr[m.actuator_trnid[actuator, 0]]
+        place = first + m.wrap_objid[first:].tolist().index(joints[0])
+        gear *= abs(float(m.wrap_prm[place]))
+    return gear if joints and gear > 0 else 1.0
 
 
 class ActuatorDelay(DriveEffect):
