@@ -207,6 +207,8 @@ def main() -> None:
     """Try what is not tried yet, and write the page."""
     args = tyro.cli(Args, description=__doc__)
     data = read_data(NAME)
+    if missing := [str(folder) for folder in args.folders if not (folder / "runs").is_dir()]:
+        raise SystemExit(f"trials: no trainings in {', '.join(missing)}; expected folders of benchmarks.train.learning")
     for folder in args.folders:
         kept = Measurements(folder / f"{NAME}.jsonl")
         ended = (folder / "runs").glob(f"{CASE}_{args.stage}_*/{RESULT}")

@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 
 
@@ -31,3 +33,10 @@ def test_prediction_is_of_insertion_alone(trials):
     away = row(9, 0, task="stacking", stage="insert") | {"stress": {"successes": 50, "episodes": 50}}
     assert "over 4 policies" in trials.page([*rows, away])
     assert "correlation over 4 policies, settings and seeds mixed: 1.00" in trials.page([*rows, away])
+
+
+def test_a_folder_without_trainings_is_refused_and_no_page_is_written(trials, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["trials", str(tmp_path)])
+    monkeypatch.setattr(trials, "write_page", lambda *_: pytest.fail("a page is written"))
+    with pytest.raises(SystemExit, match="no trainings in"):
+        trials.main()

@@ -95,12 +95,12 @@ def test_a_force_of_no_known_form_decides_where_no_effect_explains_enough_of_lit
     assert (concluded.unexplained, concluded.explains) == ((1.0, False) if verdict == "none_of_these" else (0.0, True))
 
 
-@pytest.mark.parametrize(("error", "refused", "verdict"), [(0.02, True, "none_needed"), (None, True, "none_of_these")])
-def test_what_may_be_an_error_of_the_models_own_friction_needs_no_effect(monkeypatch, error, refused, verdict):
+@pytest.mark.parametrize(("error", "verdict"), [(0.02, "none_needed"), (None, "none_of_these")])
+def test_what_may_be_an_error_of_the_models_own_friction_needs_no_effect(monkeypatch, error, verdict):
     force_is(monkeypatch, lambda *_: None)
     made, given, asked = procedure(), node(9.0), []
     made._error_of_own_friction = lambda one: asked.append(one) or error
-    made.record.findings = [finding("a", 0.1, accepted=not refused)]
+    made.record.findings = [finding("a", 0.1, accepted=False)]
     last = node(1.4, nominal=1)
     concluded = made.conclude(given, [last], (), ())
     assert (concluded.verdict, asked) == (verdict, [last])

@@ -18,6 +18,7 @@ import numpy as np
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.search.adequacy import channel_residuals
 from concent_warp.diagnosis.search.nominal_values import nominal_sensitivities, possible_nominal_effects
 from concent_warp.diagnosis.search.unknown_force import (
     Results,
@@ -31,6 +32,7 @@ from concent_warp.effects.effect import Effect, Variable
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.library.nominal import FRICTION_TOLERANCE, NominalFriction
 from concent_warp.effects.unknown_force import UnknownJointForce
+from concent_warp.fit.effects.robust import robust_noise_ratio
 
 
 def flexible_correction(
@@ -65,9 +67,9 @@ def flexible_correction(
 def error_of_own_friction(last: FittedModel, cfg: DiagnoseCfg, results: Results) -> float | None:
     """Return what a model leaves over what its own dry friction does, where it may be the error of that formula.
 
-    Both are RMS changes of the predictions. It is None where more is left than `DiagnoseCfg.form_error_ratio`, or than
-    a tenth of what friction does, see `DiagnoseCfg.small_form_error`; and where a force of no known form explains most
-    of it, which other variables than those of friction may cause.
+    Both are RMS changes of the predictions. It is None where more is left than `DiagnoseCfg.form_error_ratio`, in any
+    channel, or than a tenth of what friction does, see `DiagnoseCfg.small_form_error`; and where a force of no known
+    form explains most of it, which other variables than those of friction may cause.
 
     Args:
         last: The fitted model, to which no effect was added.
@@ -76,7 +78,11 @@ def error_of_own_friction(last: FittedModel, cfg: DiagnoseCfg, results: Results)
     """
     left = last.ratio**2 - 1
     kinds = [kind for kind in possible_nominal_effects(last.model) if isinstance(kind, NominalFriction)]
-    if last.ratio > cfg.form_error_ratio or left <= 0 or not kinds:
+    runs = all("mujoco" in added.effect.engines for added in last.model.effects)
+    if last.ratio > cfg.form_error_ratio or left <= 0 or not kinds or not runs:
+        return None
+    worst = max(robust_noise_ratio([r]) for r in channel_residuals(last).values())
+    if last.noise_scale * worst > cfg.form_error_ratio:
         return None
     columns = nominal_sensitivities(last).of(kinds) / FRICTION_TOLERANCE
     share = float(np.sqrt(left / max((np.nan_to_num(columns) ** 2).sum(axis=1).mean(), 1e-12)))

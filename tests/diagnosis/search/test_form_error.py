@@ -117,26 +117,29 @@ def test_a_remainder_that_a_correction_takes_away_is_an_error_of_form(lacking, w
 
 
 @pytest.mark.parametrize(
-    ("ratio", "friction", "explained", "found"),
+    ("ratio", "friction", "explained", "channel", "found"),
     [
-        (1.5, 20.0, 0.0, 0.056),  # sqrt(1.25) x noise beside 20
-        (1.5, 20.0, 0.27, 0.056),  # of 2.25, half of 1.25
-        (1.5, 20.0, 0.29, None),
-        (1.5, 11.0, 0.0, None),  # more than a tenth
-        (2.1, 50.0, 0.0, None),  # too much beside the noise
-        (1.0, 50.0, 0.0, None),
-        (1.5, None, 0.0, None),  # no friction at all
+        (1.5, 20.0, 0.0, 1.9, 0.056),  # sqrt(1.25) x noise beside 20
+        (1.5, 20.0, 0.27, 1.9, 0.056),  # of 2.25, half of 1.25
+        (1.5, 20.0, 0.29, 1.9, None),
+        (1.5, 20.0, 0.0, 2.1, None),  # one channel is farther off
+        (1.5, 11.0, 0.0, 1.9, None),  # more than a tenth
+        (2.1, 50.0, 0.0, 1.9, None),  # too much beside the noise
+        (1.0, 50.0, 0.0, 1.0, None),
+        (1.5, None, 0.0, 1.9, None),  # no friction at all
     ],
 )
 def test_what_is_little_beside_the_models_own_friction_may_be_its_error(
-    monkeypatch, with_friction, ratio, friction, explained, found
+    monkeypatch, with_friction, ratio, friction, explained, channel, found
 ):
     model = (
         with_friction.model
         if friction is None
         else Model(Scene(swing_scene().replace("damping=", "frictionloss='0.01' damping=")))
     )
-    one = SimpleNamespace(model=model, ratio=ratio)
+    one = SimpleNamespace(model=model, ratio=ratio, noise_scale=1.0)
+    seen = {"quiet": np.ones(40), "loud": np.full(40, channel)}
+    monkeypatch.setattr(form_error, "channel_residuals", lambda _: seen)
     columns = np.full((100, 1), 0.05 * (friction or 1.0))
     monkeypatch.setattr(form_error, "nominal_sensitivities", lambda _: SimpleNamespace(of=lambda _kinds: columns))
     force = UnknownForceFound("a force", explained, 0.01, 1.0) if explained else None
