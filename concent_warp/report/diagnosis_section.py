@@ -29,6 +29,10 @@ FAMILIES = {
     "world": "world",
     "measurement": "measurement",
 }
+QUIET_RATIO = 1.25
+"""Residual over noise up to which the page says that the model explains the noise [-]: `DiagnoseCfg.adequate_ratio`.
+More is left where noise is uncertain, or where it may be the error of the model's own friction."""
+NOISE_REACHED = "the model explains the measurements down to their noise"
 
 
 def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
@@ -70,7 +74,9 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
     if diagnosis.get("remainder_searched") is False:
         left += " Whether something smaller is missing too was not settled in this time."
     if diagnosis["verdict"] == "none_needed":
-        return "No discrepancy was detected: the model explains the measurements down to their noise."
+        ratio = (diagnosis.get("ratio") or [1.0])[-1]
+        much = f"residuals are {ratio:.2f} x noise" if ratio > QUIET_RATIO else NOISE_REACHED
+        return f"No discrepancy was detected: {much}."
     if diagnosis["verdict"] == "unsettled":
         best = f" The best so far: {_gain_sentence(accepted)}" if accepted else ""
         step = diagnosis.get("time_step") or {}

@@ -88,6 +88,12 @@ def test_no_effect_is_reported_in_words(verdict, said):
     assert ("<details open>" in section) == (verdict == "none_needed")
 
 
+def test_without_an_effect_noise_is_what_is_left_only_where_no_more_is():
+    for ratio, said in ((1.25, "down to their noise"), (1.36, "residuals are 1.36 x noise")):
+        section = diagnosis_section({"verdict": "none_needed", "effects": [], "ratio": [9.0, ratio]})
+        assert said in words_of(section)
+
+
 def test_what_was_found_is_named_beside_what_no_effect_explains():
     partly = {**NAMED, "verdict": "none_of_these", "groups": [["joint_friction", "mass"], ["drag"]], "unexplained": 0.3}
     partly["effects"] = [effect("joint_friction", 0.5, 0.005), effect("drag", 0.2, 0.01), effect("wind", 0.1, 0.3)]
