@@ -114,9 +114,9 @@ def ground(
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("pick_align_insert").run
-        >>> cfg = cw.GroundCfg(fit=cw.FitCfg(generations=1))
-        >>> result = cw.ground(run.recording, "grounded", cfg, start=run.model, engine="mujoco")
+        >>> recording = cw.load_policy("shape_sorter").run.recording
+        >>> cfg = cw.GroundCfg(geometry=cw.ContactGeometryCfg(count=64), fit=cw.FitCfg(generations=1))
+        >>> result = cw.ground(recording, "grounded", cfg, engine="mujoco")
         >>> result.comparison.after
         'after'
     """

@@ -77,8 +77,9 @@ def fit_geometry(
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("pick_align_insert").run
-        >>> fit = cw.fit_geometry(run.model, run.recording, cw.FitCfg(generations=1), engine="mujoco")
+        >>> recording = cw.load_policy("shape_sorter").run.recording
+        >>> model, start = cw.Model.from_recording(recording), cw.ContactGeometryCfg(count=64)
+        >>> fit = cw.fit_geometry(model, recording, cw.FitCfg(generations=1), start=start, engine="mujoco")
         >>> fit.stopped
         'all 1 generations done'
     """

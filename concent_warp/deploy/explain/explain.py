@@ -73,7 +73,7 @@ def explain(
         >>> policy = cw.load_policy("shape_sorter")
         >>> result = cw.evaluate(policy, cw.EvaluateCfg(action_scale=0.05), episodes=1, record="trials")
         >>> trials = cw.load_recording(result.recorded)
-        >>> cw.explain(policy.scaled(0.05), trials, cw.ExplainCfg(repetitions=2, diagnose=False)).cause
+        >>> cw.explain(policy.scaled(0.05), trials, cw.ExplainCfg(simulated=4, diagnose=False)).cause
         'policy'
     """
     cfg = cfg or ExplainCfg()

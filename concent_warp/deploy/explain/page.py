@@ -48,7 +48,7 @@ def write_explanation(
         >>> policy = cw.load_policy("shape_sorter")
         >>> result = cw.evaluate(policy, cw.EvaluateCfg(action_scale=0.05), episodes=1, record="slow")
         >>> trials, slow = cw.load_recording(result.recorded), policy.scaled(0.05)
-        >>> explanation = cw.explain(slow, trials, cw.ExplainCfg(repetitions=2, diagnose=False))
+        >>> explanation = cw.explain(slow, trials, cw.ExplainCfg(simulated=4, diagnose=False))
         >>> cw.write_explanation("explanation.html", slow, trials, explanation)
     """
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
