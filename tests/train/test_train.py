@@ -27,7 +27,7 @@ from concent_warp.train.run import TrainingRun, train_run
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.evaluate import run_episodes, wilson
 
-LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
+LEARNING = PpoCfg(iterations=28, hidden=(64, 64), learning_rate=2e-3)
 SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 
 
