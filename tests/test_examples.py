@@ -92,7 +92,7 @@ def test_the_block_is_tracked_as_it_is_lifted(run):
 
 
 def test_fit_writes_a_model_whose_replay_is_nearer_to_the_recording(run, tmp_path):
-    said = run("steps/fit_geometry.py", "--generations", 6, "--spheres", 64, "--out", tmp_path)
+    said = run("steps/fit_geometry.py", "--generations", 3, "--spheres", 64, "--out", tmp_path)
     ((before, after),) = re.findall(r"^block position: ([\d.]+) -> ([\d.]+) mm", said, re.MULTILINE)
     assert float(after) < float(before)
     geometry = cw.load_model(tmp_path / "model.toml").geometry
