@@ -120,6 +120,7 @@ def test_rebounds_of_a_rigid_contact_are_no_effect_of_anything_else():
     # The simulated contact of the model lasts 8 ms: with it a ball seems to rebound from a floor that lies higher.
     scene = SCENE.replace('<framequat name="orientation" objtype="body" objname="ball"/>', "")
     scene = scene.replace("-40000 -20", "-160000 -56").replace('friction="0.3"', 'condim="1"')
+    scene = scene.replace(f'timestep="{STEP}"', 'timestep="0.002"')
     recording = Recording(scene, tuple(dropped(0.8, seed) for seed in range(4)))
     found = diagnosed(recording, ("frame_offset", "size", "wind"))
     assert (found.verdict, [f.name for f in found.accepted]) == ("none_needed", [])
