@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import tomllib
 from pathlib import Path
 
@@ -13,11 +15,19 @@ LONG = (
     *("test_disk_full.py", "test_flow_at_work.py", "test_front_door.py", "test_distil_benchmark.py"),
 )
 """Files of most of a minute, the longest first."""
+os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
+"""Where a number of processes is not given, work is done in the test's own: one worker a CPU runs tests already."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first, so that no worker begins one when the others have nothing left to do."""
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
+def pytest_collection_finish() -> None:
+    """Leave what all tests together have imported out of every garbage collection to come."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
