@@ -143,6 +143,9 @@ class SearchCfg:
     """Rivals whose initial states are tried on the baseline. Empirical."""
     polished_first: Count = 1
     """Most fits whose initial states are fitted again before the others start from those of the best. Empirical."""
+    promoted_share: Share = 0.7
+    """Gain that a candidate promises beside nominal values within their tolerance, over the best one's, from which it
+    is fitted for that [-]. Empirical."""
     stuck_share: Share = 0.5
     """Share of what a candidate promised below which its fit counts as stuck in a local minimum [-]: linear
     extrapolation is taken to be right to a factor of 2."""

@@ -55,6 +55,39 @@ def node(
     )  # fmt: skip
 
 
+class Comparison:
+    """Compares made-up fits beside nominal values by errors that it is given."""
+
+    sensitivities: Any = "shared"
+
+    def __init__(self, base: Any, left: dict[str, np.ndarray] | None = None, *, decides: bool = False) -> None:
+        """Compare fits for a model, by default as where all is so far off that nominal values say nothing.
+
+        Args:
+            base: The model.
+            left: What is left beside nominal values, a residual of size 1 in all; by default the errors themselves.
+            decides: Whether candidates are to be compared so.
+        """
+        self.base, self.left, self.decides = base, left or {}, decides
+
+    def errors(self, one: Any) -> np.ndarray:
+        """Return what a fit leaves, by its name."""
+        left = self.left.get(one.name if hasattr(one, "name") else one.model.name)
+        return one.errors if left is None else left
+
+    def ratio(self, one: Any) -> float:
+        """Return the same as a root mean square."""
+        return float(np.sqrt(self.errors(one).sum())) if self.left else np.inf
+
+    def tells(self, _candidates: Any, _cfg: Any) -> bool:
+        """Return whether candidates are to be compared so."""
+        return self.decides
+
+    def promoted(self, screened: Any, _cfg: Any) -> Any:
+        """Return candidates as they are."""
+        return screened
+
+
 def procedure(**changes: Any) -> Any:
     """Return a procedure, with settings; it replays nothing without `explain`: made-up models cannot be simulated.
 
@@ -64,6 +97,7 @@ def procedure(**changes: Any) -> Any:
     made.seen = []  # pyright: ignore[reportAttributeAccessIssue]
     made.context.runner = TaskRunner(1, lambda share, text: made.seen.append((share, text)))  # pyright: ignore
     made._error_of_own_friction = lambda _: None  # pyright: ignore
+    made.context.beside_nominal = Comparison  # pyright: ignore
     if not made.context.cfg.explain:
         made._replayed = lambda *_: None  # pyright: ignore
     return made

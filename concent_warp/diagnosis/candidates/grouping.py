@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.candidates.evidence import indistinguishable
+from concent_warp.diagnosis.candidates.evidence import equal_at_noise, indistinguishable
 from concent_warp.diagnosis.candidates.fit_candidate import polish_candidate
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import TimeBudget
+
+Pair = tuple[FittedCandidate, Finding]
+"""A candidate and its evidence."""
 
 
 def group_indistinguishable(
@@ -22,6 +27,7 @@ def group_indistinguishable(
     runner: TaskRunner,
     cfg: DiagnoseCfg,
     budget: TimeBudget | None = None,
+    compare: Callable[[FittedModel | FittedCandidate], np.ndarray] | None = None,
 ) -> list[tuple[FittedCandidate, Finding]]:
     """Return the accepted candidates that cannot be distinguished from the best, the most plausible first.
 
@@ -36,6 +42,8 @@ def group_indistinguishable(
         runner: Runs the evaluations.
         cfg: Settings.
         budget: What has no time is left out and noted there.
+        compare: Returns the held-out errors of blocks, shape (B,), by which candidates and baseline are compared; by
+            default their own.
     """
     search, budget = cfg.search, budget or TimeBudget(None)
 
@@ -47,16 +55,29 @@ def group_indistinguishable(
         # An accepted effect stays accepted: its gain is the evidence, even where a rough cost widens its interval.
         return c, replace(assess(c), accepted=True, reason="")
 
-    near = indistinguishable(base, accepted, search, slack=search.near_equal_factor)
-    if (
-        len(near) > len(indistinguishable(base, accepted, search))
-        and len(base.windows) <= base.cfg.least_squares.max_polished_windows
-    ):
+    def alike(pairs: Sequence[Pair], slack: float = 1.0) -> list[Pair]:
+        if compare is None:
+            return indistinguishable(base, pairs, search, slack)
+        beside, pairs = replace(base, errors=compare(base)), list(pairs)
+        weighed = [_weighed(beside, c, f, compare(c)) for c, f in pairs]
+        places = {id(c): k for k, (c, _) in enumerate(weighed)}
+        group = equal_at_noise(beside, indistinguishable(beside, weighed, search, slack), weighed, search)
+        return [pairs[places[id(c)]] for c, _ in group]
+
+    near = alike(accepted, search.near_equal_factor)
+    if len(near) > len(alike(accepted)) and len(base.windows) <= base.cfg.least_squares.max_polished_windows:
         first, rest = near[: search.profiled], near[search.profiled :]
         near = [with_evidence(profiled(c)) for c, _ in first] + rest
-    group = indistinguishable(base, near, search)
+    group = alike(near)
     best = group[0][0]
     unsettled = f"Fit not refined: {best.effect.name}."
     best = budget.attempt(lambda: polish_candidate(base, best, search, thorough=True), best, unsettled)
     group[0] = with_evidence(best)
     return group
+
+
+def _weighed(beside: FittedModel, c: FittedCandidate, f: Finding, errors: np.ndarray) -> Pair:
+    """Return a candidate and its evidence with other held-out errors of blocks, shape (B,)."""
+    count = sum(len(piece.residual) for piece in c.pieces)
+    c = replace(c, errors=errors, ratio=beside.noise_scale * float(np.sqrt(errors.sum() / count)))
+    return c, replace(f, gain=c.share(beside))

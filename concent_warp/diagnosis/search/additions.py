@@ -17,6 +17,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedM
 from concent_warp.diagnosis.candidates.evidence import largest_size, leaves_more
 from concent_warp.diagnosis.result import Detectable
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio
+from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
@@ -97,7 +98,9 @@ class Additions:
             correction = None if effects_alone else self._correction(fitted[-1], first)
             try:
                 adequate = not effects_alone and context.explains(fitted[-1], first, added=step > 0)
-                best, smallest = self.finder.find(fitted[-1], step, explained=adequate)
+                best, smallest = self.finder.find(
+                    fitted[-1], step, explained=adequate, beside_nominal=not effects_alone and cfg.nominal.enabled
+                )
             except TimeUpError:
                 context.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
                 if bounded is not None:
@@ -112,14 +115,15 @@ class Additions:
                     len(record.holding),
                 )
                 continue
-            equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
+            beside = None if best is None or effects_alone else self._comparison(fitted[-1], best)
+            least = None if best is None else best.errors if beside is None else beside.errors(best)
             if bounded is not None and (
-                best is None or not leaves_more(errors_like(bounded[-1], fitted[-1]), best.errors, cfg.search)
+                least is None or not leaves_more(errors_like(bounded[-1], fitted[-1]), least, cfg.search)
             ):
                 record.forget(*recorded)
                 fitted, record.constants = bounded, before
                 continue
-            if finer is not None and errors_like(finer, fitted[-1]).sum() <= equal:
+            if finer is not None and (least is None or self._explains_as_much(finer, fitted[-1], least, beside)):
                 record.forget(*recorded)
                 fitted = self._adopt(fitted, finer)
                 continue
@@ -253,20 +257,23 @@ class Additions:
         """
         enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
         both = None if finer is None else self._nominal(finer, enough)
-        plain = self._nominal(fitted[-1], enough)
+        plain = self._nominal(fitted[-1], enough, with_step=finer is None)
         if finer is not None and both is not None and (plain is None or self._needs_step(plain, both)):
             return [*self._adopt(fitted, finer)[:-1], both]
         return None if plain is None else [*fitted[:-1], plain]
 
-    def _nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None) -> FittedModel | None:
+    def _nominal(
+        self, one: FittedModel, enough: Callable[[FittedModel], bool] | None, *, with_step: bool = False
+    ) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
 
         Errors of nominal values may hide those of the simulator's constants, and nominal values stand in for these:
-        where they leave more than noise, friction that holds is tried beside them.
+        where they leave more than noise, friction that holds is tried beside them, and then a shorter time step.
 
         Args:
             one: The fitted model.
             enough: Whether a model with values at their bounds leaves little enough.
+            with_step: Whether to try a shorter time step beside them.
         """
         context, holding = self.context, self.context.record.holding
         found = context.nominal_fit(one)
@@ -275,12 +282,34 @@ class Additions:
         held = self.with_holding(found)
         if stays_within(held, context.cfg.nominal, enough):
             return held
+        finer = self._finer(held) if with_step else None
+        if finer is not None and stays_within(finer, context.cfg.nominal, enough):
+            return self._adopt([held], finer)[-1]
         context.record.holding = holding
         return found if stays_within(found, context.cfg.nominal, enough) else None
 
     def _needs_step(self, plain: FittedModel, finer: FittedModel) -> bool:
         """Return whether a model explains more with a shorter time step, which nominal values may stand in for."""
         return bool(errors_like(finer, plain).sum() < (1 - self.context.cfg.min_gain) * plain.errors.sum())
+
+    def _comparison(self, one: FittedModel, best: FittedCandidate) -> BesideNominalValues | None:
+        """Return what compares a candidate beside nominal values where these are compared so, else None."""
+        found = self.context.beside_nominal(one) if self.context.cfg.nominal.enabled else None
+        return found if found is not None and found.tells([best], self.context.cfg) else None
+
+    def _explains_as_much(
+        self, finer: FittedModel, one: FittedModel, least: np.ndarray, beside: BesideNominalValues | None
+    ) -> bool:
+        """Return whether a model with a shorter time step leaves no more than a candidate does.
+
+        Args:
+            finer: The model with a shorter time step.
+            one: The model as the candidate was added to it.
+            least: Held-out errors of blocks that the candidate leaves, shape (B,).
+            beside: Compares beside nominal values, None where the candidate was not compared so.
+        """
+        left = errors_like(finer, one) if beside is None else beside.errors(finer)
+        return bool(left.sum() <= (1 + self.context.cfg.search.equal_error) * least.sum())
 
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
         """Return the fitted models with the last one replaced by that with a shorter time step."""

@@ -12,7 +12,13 @@ from typing import Any, TypeVar
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, least_ratio
-from concent_warp.diagnosis.search.nominal_values import nominal_effects, stays_within, with_nominal_values
+from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
+from concent_warp.diagnosis.search.nominal_values import (
+    nominal_effects,
+    nominal_sensitivities,
+    stays_within,
+    with_nominal_values,
+)
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.diagnosis.time_budget import TimeBudget
@@ -38,6 +44,7 @@ class SearchContext:
         self.noise_factors: Mapping[str, float] = {}
         """By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-]."""
         self.record = SearchRecord()
+        self._beside: BesideNominalValues | None = None
 
     def progress(self, text: str) -> None:
         """Report what is being done."""
@@ -147,5 +154,20 @@ class SearchContext:
             return None
         self.progress("fitting nominal values within their tolerance")
         unsettled = "Open: whether nominal values are off within their tolerance."
-        fit = partial(with_nominal_values, one, self.cfg.nominal, self.least_gain(one))
+        beside = self.beside_nominal(one)
+        if beside is None:
+            return None
+        fit = partial(with_nominal_values, one, self.cfg.nominal, self.least_gain(one), beside.sensitivities)
         return self.budget.attempt(fit, None, unsettled)
+
+    def beside_nominal(self, base: FittedModel) -> BesideNominalValues | None:
+        """Return what compares candidates for a fitted model beside nominal values, None where there was no time.
+
+        Args:
+            base: The fitted model.
+        """
+        if self._beside is None or self._beside.base is not base:
+            unsettled = "Left out of the comparison of candidates: errors of nominal values."
+            found = self.budget.attempt(partial(nominal_sensitivities, base), None, unsettled)
+            self._beside = None if found is None else BesideNominalValues(base, found)
+        return self._beside

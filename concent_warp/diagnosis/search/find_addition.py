@@ -32,14 +32,12 @@ from concent_warp.diagnosis.candidates.screening import linear_at_measured_state
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
+from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
 from concent_warp.diagnosis.search.joint_fit import established_effects, joint_parameters
 from concent_warp.diagnosis.search.nominal_values import (
-    NominalSensitivities,
-    errors_beside_nominal_values,
     nominal_effects,
     nominal_errors,
-    nominal_sensitivities,
 )
 from concent_warp.diagnosis.search.reconsider import near_best
 from concent_warp.diagnosis.time_budget import in_words
@@ -73,7 +71,7 @@ class AdditionFinder:
         self.context, self.channels, self.windows, self.gradient = context, channels, windows, gradient
 
     def find(
-        self, base: FittedModel, step: int, *, explained: bool = False
+        self, base: FittedModel, step: int, *, explained: bool = False, beside_nominal: bool = False
     ) -> tuple[FittedCandidate | None, tuple[Detectable, ...]]:
         """Return the effect to add to a fitted model, None where none is accepted, and the detectable sizes of all.
 
@@ -82,6 +80,7 @@ class AdditionFinder:
             step: Index of the addition.
             explained: Whether the model explains the data already. An effect is then accepted only if the intervals
                 that the answer would state, see `joint_parameters`, exclude its null values too.
+            beside_nominal: Whether candidates are compared beside nominal values within their tolerance.
 
         Raises:
             TimeUpError: There was no time to fit a candidate.
@@ -112,6 +111,9 @@ class AdditionFinder:
 
         context.enter_addition(step, SCREENED_PART, FITTED_PART)
         least = self._least_promise(base)
+        beside = context.beside_nominal(base) if beside_nominal else None
+        if beside is not None:
+            screened = beside.promoted(screened, cfg)
         fits = CandidateFits(base, cfg, context.runner)
         fitted = fits.fit(screened, needed, short_windows, least)
         if parts and context.record.provisional is None and self._leaves_more(base, fitted):
@@ -130,10 +132,14 @@ class AdditionFinder:
             unsettled = "Open: whether other initial states let the model explain more without an effect."
             base = context.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
             findings = [finding(c) for c in fitted]
+        wanted = (explained or beside_nominal) and any(f.accepted for f in findings)
+        beside = context.beside_nominal(base) if wanted else None
         if explained:
-            findings = self._established(base, fitted, findings, quiet=quiet)
+            findings = self._established(base, fitted, findings, beside, quiet=quiet)
         elif not quiet:
             findings = with_scattering(base, fitted, findings, cfg.search)
+        if beside is not None and beside_nominal:
+            findings = self._beyond_nominal(beside, fitted, findings, step)
         whole = [f for f in findings if f.accepted and f.gain >= self._least_share(base)]
         context.record.part_refused = not whole and any(f.accepted for f in findings)
         if context.record.part_refused:
@@ -145,7 +151,9 @@ class AdditionFinder:
             context.record.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
         context.enter_addition(step, FITTED_PART, 1.0)
-        group = group_indistinguishable(base, accepted, finding, context.runner, cfg, context.budget)
+        tells = beside is not None and beside_nominal and beside.tells([c for c, _ in accepted], cfg)
+        compare = beside.errors if beside is not None and tells else None
+        group = group_indistinguishable(base, accepted, finding, context.runner, cfg, context.budget, compare)
         context.record.rivals[step] = near_best(base, fitted, findings, cfg)
         best = group[0][0]
         context.record.add(group, findings, profile_widening(base, best))
@@ -205,7 +213,13 @@ class AdditionFinder:
             return []
 
     def _established(
-        self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding], *, quiet: bool
+        self,
+        base: FittedModel,
+        fitted: Sequence[FittedCandidate],
+        findings: Sequence[Finding],
+        beside: BesideNominalValues | None,
+        *,
+        quiet: bool,
     ) -> list[Finding]:
         """Return findings, accepted ones with the intervals of the answer, refused if these include the null values.
 
@@ -215,16 +229,12 @@ class AdditionFinder:
         and zeros of readings are as good as a calibration, and no nominal value stands for them.
         """
         found = list(findings)
-        if not any(f.accepted for f in findings):
-            return found
-        unsettled = "Left out of the intervals of candidates: errors of nominal values."
-        shared = self.context.budget.attempt(partial(nominal_sensitivities, base), None, unsettled)
         for k, (c, f) in enumerate(zip(fitted, findings, strict=True)):
             if not f.accepted:
                 continue
             added = add_candidate(base, c)
             widening = {len(added.model.effects) - 1: profile_widening(base, c)}
-            nominal = None if shared is None else nominal_errors(added, self.context.cfg, shared)
+            nominal = None if beside is None else nominal_errors(added, self.context.cfg, beside.sensitivities)
             parameters = joint_parameters(added, widening, nominal)
             found[k] = replace(f, parameters=parameters[-1])
             share = self.context.cfg.search.dependent_share
@@ -233,7 +243,7 @@ class AdditionFinder:
             elif quiet and f.gain < self.context.cfg.quiet_min_gain:
                 if f.family == "measurement" and not self.context.record.beside_impacts:
                     found[k] = replace(found[k], accepted=False, reason="removes little, as calibrations do")
-                elif not self._is_beside_nominal(base, c, shared):
+                elif beside is None or not self._removes(beside, c, self.context.cfg.min_gain):
                     reason = "removes little, and less beside nominal values within their tolerance"
                     found[k] = replace(found[k], accepted=False, reason=reason)
         return found
@@ -246,18 +256,36 @@ class AdditionFinder:
         given = self.context.record.time_step is None and not nominal_effects(base.model)
         return self.context.cfg.nominal.enabled and given
 
-    def _is_beside_nominal(self, base: FittedModel, c: FittedCandidate, shared: NominalSensitivities | None) -> bool:
-        """Return whether a candidate removes enough beside all nominal values within their tolerance.
+    def _beyond_nominal(
+        self, beside: BesideNominalValues, fitted: Sequence[FittedCandidate], findings: Sequence[Finding], step: int
+    ) -> list[Finding]:
+        """Return findings, accepted ones refused that explain little beyond all nominal values within their tolerance.
+
+        Of a model that is far off that says little: many values near their bounds at once are less plausible than one
+        effect. What an effect leaves is another matter where they explain all of it, down to the noise.
 
         Args:
-            base: The fitted model.
-            c: The candidate.
-            shared: Sensitivities of the model to its nominal values, None where there was no time for them.
+            beside: Compares beside nominal values.
+            fitted: The candidates.
+            findings: Their evidence, in the same order.
+            step: Index of the addition.
         """
-        if shared is None:
-            return False
-        cfg, (before, after) = self.context.cfg, errors_beside_nominal_values(base, c, shared)
-        return bool(after.sum() <= (1 - cfg.min_gain) * before.sum() and leaves_more(before, after, cfg.search))
+        cfg, base = self.context.cfg, beside.base
+        factor = least_ratio(base, self.context.noise_factors) / max(base.ratio, 1e-12)
+        explained = factor * beside.ratio(base) <= cfg.search.explained_ratio
+        if base.ratio > cfg.form_error_ratio and not (step and explained):
+            return list(findings)
+        needed = cfg.quiet_min_gain if explained else cfg.min_gain
+        reason = "explains little beyond nominal values within their tolerance"
+        return [
+            replace(f, accepted=False, reason=reason) if f.accepted and not self._removes(beside, c, needed) else f
+            for c, f in zip(fitted, findings, strict=True)
+        ]
+
+    def _removes(self, beside: BesideNominalValues, c: FittedCandidate, share: float) -> bool:
+        """Return whether a candidate removes a share of what all nominal values within their tolerance leave."""
+        before, after = beside.errors(beside.base), beside.errors(c)
+        return bool(after.sum() <= (1 - share) * before.sum() and leaves_more(before, after, self.context.cfg.search))
 
     def _screened(
         self, base: FittedModel, effects: Sequence[Effect], step: int, part: float = 1.0

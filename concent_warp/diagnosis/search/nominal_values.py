@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import fitted_model
-from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, nominal_parameters
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import NOMINAL
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
-from concent_warp.fit.effects.least_squares import Linear
 from concent_warp.fit.effects.robust import huber_weight
 from concent_warp.model import Model
 
 
-def with_nominal_values(base: FittedModel, cfg: NominalCfg, min_gain: float) -> FittedModel | None:
+def with_nominal_values(
+    base: FittedModel, cfg: NominalCfg, min_gain: float, sensitivities: NominalSensitivities | None = None
+) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
     It is None where none shows, or where they remove too little of the held-out error.
@@ -28,8 +29,9 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg, min_gain: float) -> 
         base: The fitted model.
         cfg: Settings.
         min_gain: Share of the held-out error that they must remove [-].
+        sensitivities: Those of the model to its nominal values; by default they are simulated.
     """
-    visible, promised = _visible(base, cfg)
+    visible, promised = _visible(base, cfg, sensitivities or nominal_sensitivities(base))
     if not visible or promised < cfg.promised_share * min_gain:
         return None
     compiled = base.model.compile()
@@ -96,7 +98,11 @@ class NominalSensitivities:
 
     def of(self, kinds: Sequence[Effect]) -> np.ndarray:
         """Return the sensitivities to some nominal values alone, shape (n, k)."""
-        wanted = {(effect.name, target) for effect in kinds for target in effect.target}
+        return self.named([(effect.name, target) for effect in kinds for target in effect.target])
+
+    def named(self, names: Iterable[tuple[str, str]]) -> np.ndarray:
+        """Return the sensitivities to nominal values of these names and targets alone, shape (n, k)."""
+        wanted = set(names)
         return self.columns[:, [name in wanted for name in self.names]]
 
 
@@ -107,38 +113,6 @@ def nominal_sensitivities(base: FittedModel) -> NominalSensitivities:
     rows = sum(len(piece.residual) for piece in base.pieces)
     columns = np.concatenate(_sensitivities(base, kinds)) if kinds else np.zeros((rows, 0))
     return NominalSensitivities(names, columns)
-
-
-def errors_beside_nominal_values(
-    base: FittedModel, candidate: FittedCandidate, sensitivities: NominalSensitivities
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return held-out errors of blocks, shape (B,), of a model and with a candidate, both beside nominal values.
-
-    All nominal values within their tolerance, by a linear step, take up what they can of either: less those that the
-    candidate stands for, of what it leaves.
-
-    Args:
-        base: The fitted model.
-        candidate: An effect that was fitted to it.
-        sensitivities: Those of the model to its nominal values.
-    """
-    fitted = {added.effect.name for added in base.model.effects}
-
-    def beside(model: Model, pieces: Sequence[Linear]) -> np.ndarray:
-        kinds = [kind for kind in possible_nominal_effects(model) if kind.name not in fitted]
-        columns = np.nan_to_num(sensitivities.of(kinds), posinf=0.0, neginf=0.0) / base.cfg.least_squares.prior
-        ends = np.cumsum([len(piece.residual) for piece in pieces])[:-1]
-        more = np.split(columns, ends)
-        joined = [
-            replace(piece, jacobian=np.hstack([piece.jacobian, of])) for piece, of in zip(pieces, more, strict=True)
-        ]
-        own = nominal_parameters(base.model)
-        shared = np.pad(own, (0, joined[0].jacobian.shape[1] - len(own)))
-        shared[shared.size - columns.shape[1] :] = True
-        sums = block_sums(joined, base.blocks, base.limit)
-        return HeldOut(sums, base.blocks, base.cfg.least_squares.prior, shared).own()
-
-    return beside(base.model, base.pieces), beside(candidate.model, candidate.pieces)
 
 
 def nominal_errors(
@@ -214,7 +188,7 @@ def _sensitivities(base: FittedModel, kinds: Sequence[Effect]) -> list[np.ndarra
     return [np.hstack(of_window) for of_window in zip(*columns, strict=True)]
 
 
-def _visible(base: FittedModel, cfg: NominalCfg) -> tuple[list[Effect], float]:
+def _visible(base: FittedModel, cfg: NominalCfg, sensitivities: NominalSensitivities) -> tuple[list[Effect], float]:
     """Return the nominal values that change the predictions measurably within their tolerance, as effects.
 
     Values whose changes the others can produce are left out, the least visible first. With them comes the share of the
@@ -224,9 +198,10 @@ def _visible(base: FittedModel, cfg: NominalCfg) -> tuple[list[Effect], float]:
     kinds = [e for e in possible_nominal_effects(base.model) if e.name not in present]
     if not kinds:
         return [], 0.0
-    by_window = _sensitivities(base, kinds)
     owners = [(effect, target) for effect in kinds for target in effect.target]
-    chosen, prior = _independent(np.concatenate(by_window), cfg), base.cfg.least_squares.prior
+    columns, prior = sensitivities.of(kinds), base.cfg.least_squares.prior
+    by_window = np.split(columns, np.cumsum([len(piece.residual) for piece in base.pieces])[:-1])
+    chosen = _independent(columns, cfg)
     seen = [
         replace(piece, jacobian=np.hstack([piece.jacobian, np.nan_to_num(of[:, chosen]) / prior]))
         for piece, of in zip(base.pieces, by_window, strict=True)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from concent_warp.diagnosis.candidates import grouping
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.tasks import TaskRunner
 from tests.diagnosis.candidates.made_up_fit import base_of, made
+from tests.diagnosis.made_up import finding
 
 ANY: Any = None
 
@@ -64,3 +67,54 @@ def test_the_first_of_a_group_is_polished_and_near_equals_get_a_profile(monkeypa
     assert [(f.name, f.accepted, f.reason) for _, f in group] == [("a", True, ""), ("b", True, "")]
     assert group[0][0].gain == pytest.approx(0.6 if profiled else 0.5)
     assert group[0][0].std == ("known" if profiled and not better else None)
+
+
+@dataclass(frozen=True)
+class Left:
+    """A fit or a baseline of which that is left."""
+
+    name: str
+    gain: float
+    errors: np.ndarray = field(default_factory=lambda: np.ones(2), compare=False)
+    ratio: float = 2.0
+    noise_scale: float = 1.0
+    pieces: Any = field(default_factory=lambda: [SimpleNamespace(residual=np.ones(50))])
+    effect: Any = field(default_factory=lambda: SimpleNamespace(name="effect"))
+
+    def share(self, base: Any) -> float:
+        """Return the share of the baseline's error that is gone."""
+        return 1 - float(self.errors.sum() / base.errors.sum())
+
+
+def test_candidates_are_compared_by_other_errors_than_their_own_where_these_are_given(monkeypatch):
+    first, second, third = fits = [Left(n, gain) for n, gain in (("a", 0.9), ("b", 0.6), ("c", 0.5))]
+    base, seen = Left("base", 0.0), []
+    # Beside something else the second explains most, and the third nearly as much.
+    left = {id(base): 1.0, id(first): 0.8, id(second): 0.1, id(third): 0.12}
+
+    def indistinguishable(against, pairs, _search, _slack=1.0):
+        seen.append([(c.name, float(c.errors.sum()), round(f.gain, 2), c.ratio) for c, f in pairs])
+        assert against.errors.sum() == 1.0
+        return sorted(pairs, key=lambda pair: -pair[1].gain)[:1]
+
+    monkeypatch.setattr(Left, "windows", (), raising=False)
+
+    def at_noise(against, group, pairs, _search):
+        assert against.errors.sum() == 1.0
+        return [*group, next(pair for pair in pairs if pair[0].name == "c")]
+
+    monkeypatch.setattr(grouping, "indistinguishable", indistinguishable)
+    monkeypatch.setattr(grouping, "equal_at_noise", at_noise)
+    monkeypatch.setattr(grouping, "polish_candidate", lambda _base, c, _search, **_: c)
+
+    def judged(c: Any) -> Any:
+        return finding(c.name, c.gain)
+
+    pairs: Any = [(c, judged(c)) for c in fits]
+    given: Any = base
+    group: Any = grouping.group_indistinguishable(
+        given, pairs, judged, TaskRunner(), DiagnoseCfg(jobs=1), compare=lambda one: np.full(2, left[id(one)] / 2)
+    )
+    assert [(c, f.gain) for c, f in group] == [(second, 0.6), (third, 0.5)]  # the evidence stays what it was
+    assert [entry[:3] for entry in seen[0]] == [("a", 0.8, 0.2), ("b", 0.1, 0.9), ("c", 0.12, 0.88)]
+    assert seen[0][1][3] == pytest.approx(np.sqrt(0.1 / 50))

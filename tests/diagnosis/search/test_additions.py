@@ -12,7 +12,7 @@ from concent_warp.diagnosis.search import additions, context
 from concent_warp.diagnosis.search.adequacy import is_lacking
 from concent_warp.effects.effect import Parameter
 from concent_warp.simulate.time_limit import TimeUpError
-from tests.diagnosis.made_up import FINER, GIVEN, finding, node, procedure
+from tests.diagnosis.made_up import FINER, GIVEN, Comparison, finding, node, procedure
 
 
 def one_after_the_other(made, nodes):
@@ -195,7 +195,8 @@ def test_over_short_windows_no_further_effect_is_tried_on_an_error_of_form(monke
 def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
     given, after, asked = node(5.0), node(2.0, effects=1), []
 
-    def nominal(one, cfg, min_gain):
+    def nominal(one, cfg, min_gain, sensitivities):
+        assert sensitivities == "shared"
         # Far from the noise they must explain a fifth; as near as an error of form leaves, what an effect must.
         assert (cfg, min_gain) == (made.context.cfg.nominal, 0.2 if one is given else 0.04)
         return one
@@ -215,18 +216,25 @@ def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of
 
 
 @pytest.mark.parametrize(
-    ("held", "inside", "left", "holding"),
+    ("held", "inside", "tried", "left", "holding"),
     [
-        ("held", ("held",), "held", ("joints",)),
-        ("held", (), None, ()),
-        ("held", ("values",), "values", ()),  # what holds has led a value to its bound
-        ("values", ("values",), "values", ()),  # nothing that holds explains more
+        ("held", ("held", "finer"), "", "held", ("joints",)),
+        ("held", (), "held", None, ()),
+        ("held", ("values",), "held", "values", ()),  # what holds has led a value to its bound
+        ("values", ("values",), "", "values", ()),  # nothing that holds explains more
+        ("held", ("finer", "values"), "held", "finer", ("joints",)),  # with a shorter time step it has not
+        ("values", ("finer",), "values", "finer", ()),
     ],
 )
-def test_friction_that_holds_is_tried_beside_nominal_values(monkeypatch, held, inside, left, holding):
+def test_friction_that_holds_and_a_shorter_time_step_are_tried_beside_nominal_values(
+    monkeypatch, held, inside, tried, left, holding
+):
     made, given = procedure(), node(9.0, 900.0)
-    nodes = {"values": node(1.7, 60.0, nominal=1), "held": node(1.0, 20.0, nominal=1)}
+    nodes = {"values": node(1.7, 60.0, nominal=1), "held": node(1.2, 20.0, nominal=1), "finer": node(1.0, 15.0)}
+    shortened = []
     monkeypatch.setattr(context, "with_nominal_values", lambda *_: nodes["values"])
+    monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg: shortened.append(one) or nodes["finer"])
+    monkeypatch.setattr(additions, "time_step_finding", lambda one, finer, _seed: (one, finer))
     monkeypatch.setattr(additions, "stays_within", lambda found, *_: found in [nodes[name] for name in inside])
 
     def with_holding(one):
@@ -238,6 +246,8 @@ def test_friction_that_holds_is_tried_beside_nominal_values(monkeypatch, held, i
     found = made.additions._with_nominal([given], None, given)
     assert found == (None if left is None else [nodes[left]])
     assert made.record.holding == holding
+    assert shortened == ([nodes[tried]] if tried else [])
+    assert made.record.time_step == ((nodes[held], nodes["finer"]) if left == "finer" else None)
 
 
 @pytest.mark.parametrize(
@@ -283,6 +293,30 @@ def test_an_effect_that_explains_more_comes_before_nominal_values_at_their_bound
     assert made.record.groups == ([("second",)] if left == "effect" else [])
     assert len(made.record.findings) == (left == "effect")
     assert made.record.time_step == (None if left == "effect" else "found")
+
+
+@pytest.mark.parametrize(
+    ("decides", "finer_beside", "left"),
+    [
+        (True, 30.0, "effect"),  # beside nominal values it leaves 10, the shorter time step 30
+        (True, 10.1, "finer"),
+        (False, 30.0, "finer"),  # alone it leaves 60, the shorter time step 50
+    ],
+)
+def test_an_effect_is_compared_with_a_shorter_time_step_as_it_was_with_others(monkeypatch, decides, finer_beside, left):
+    given, effect = node(3.0, 100.0, name="given"), node(1.5, 60.0, effects=1, name="effect")
+    finer, made = node(1.4, 50.0, timestep=FINER, name="finer"), procedure(max_additions=1)
+    beside = {"effect": np.full(2, 5.0), "finer": np.full(2, finer_beside / 2)}
+    made.context.beside_nominal = lambda base: Comparison(base, beside, decides=decides)
+    found = {id(given): (effect, ())}
+    monkeypatch.setattr(made.additions.finder, "find", lambda base, _step, **_: found.get(id(base), (None, ())))
+    monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg: finer if one is given else None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
+    fitted, _ = made.additions.add_effects([given], ())
+    assert fitted[-1] is (effect if left == "effect" else finer)
 
 
 def test_nominal_values_at_their_bounds_stay_where_there_is_no_time_to_look_for_an_effect(monkeypatch):
@@ -336,7 +370,7 @@ def test_no_further_effect_is_searched_where_less_is_left_than_it_must_remove(mo
     ):
         made, asked, after = procedure(), [], node(left, effects=1)
 
-        def find(_base, step, *, explained, asked=asked, after=after):
+        def find(_base, step, *, explained, asked=asked, after=after, **_):
             asked.append((step, explained))
             return (None if step else after), ()
 

@@ -13,7 +13,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search import find_addition
 from concent_warp.effects.library.drives import ActuatorGain
 from concent_warp.simulate.time_limit import TimeUpError
-from tests.diagnosis.made_up import CLEAR, OPEN, finding, node, procedure
+from tests.diagnosis.made_up import CLEAR, OPEN, Comparison, finding, node, procedure
 
 
 class MadeUp(SimpleNamespace):
@@ -217,11 +217,14 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
     ends = {"a": [OPEN], "b": [OPEN, CLEAR], "c": [CLEAR]}
     monkeypatch.setattr(find_addition, "add_candidate", lambda _base, c: c)
     monkeypatch.setattr(find_addition, "nominal_errors", lambda c, _cfg, shared: f"nominal {c.name} {shared}")
-    simulated = []
-    monkeypatch.setattr(find_addition, "nominal_sensitivities", lambda base: simulated.append(base) or "at base")
+    compared = []
+
+    def comparison(base):
+        compared.append(base)
+        return Comparison(base)
 
     def answer(c, widening, nominal):
-        assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name} at base")
+        assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name} shared")
         return [(CLEAR,), tuple(ends[c.name])]
 
     def established(_c, parameters, share, *rest):
@@ -233,13 +236,25 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
     gains = {"a": (0.9, True), "b": (0.7, True), "c": (0.6, False)}
     for explained, added, seen in ((False, "a", ["a", "b"]), (True, "b", ["b"])):
         made = procedure()
+        made.context.beside_nominal = comparison
         (best, _), _ = searched(monkeypatch, made, gains, np.zeros(10), explained=explained)
         assert best.name == added
         assert made.record.groups == [tuple(seen)]
         first = next(f for f in made.record.findings if f.name == "a")
         assert first.accepted is not explained
         assert (first.reason == "its parameters may be at their null values") is explained
-        assert len(simulated) == explained
+        assert len(compared) == explained
+
+
+class BeforeAndAfter(Comparison):
+    """Of a model and of all candidates the same is left beside nominal values."""
+
+    def __init__(self, base, before, after):
+        super().__init__(base)
+        self.before, self.after = (np.full(4, error / 4) for error in (before, after))
+
+    def errors(self, one):
+        return self.before if one is self.base else self.after
 
 
 @pytest.mark.parametrize(
@@ -259,12 +274,10 @@ def test_a_small_effect_on_the_model_as_given_counts_where_nominal_values_do_not
 ):
     monkeypatch.setattr(find_addition, "add_candidate", lambda _base, c: c)
     monkeypatch.setattr(find_addition, "nominal_errors", lambda *_: None)
-    monkeypatch.setattr(find_addition, "nominal_sensitivities", lambda _base: "shared")
     monkeypatch.setattr(find_addition, "joint_parameters", lambda *_: [(CLEAR,)])
     monkeypatch.setattr(find_addition, "established_effects", lambda *_: [True])
-    before, after = (np.full(4, error / 4) for error in beside)
-    monkeypatch.setattr(find_addition, "errors_beside_nominal_values", lambda *_: (before, after))
     made = procedure()
+    made.context.beside_nominal = lambda base: BeforeAndAfter(base, *beside)
     made.record.beside_impacts, step = step < 0, max(step, 0)
     (best, _), asked = searched(
         monkeypatch, made, {"a": (gain, True)}, np.zeros(10), 1.0, step=step, base=node(1.0, nominal=nominal),
@@ -282,18 +295,73 @@ def test_a_small_effect_on_the_model_as_given_counts_where_nominal_values_do_not
 def test_a_small_effect_of_a_sensor_counts_only_beside_errors_of_impacts(monkeypatch, gain, beside_impacts, added):
     monkeypatch.setattr(find_addition, "add_candidate", lambda _base, c: c)
     monkeypatch.setattr(find_addition, "nominal_errors", lambda *_: None)
-    monkeypatch.setattr(find_addition, "nominal_sensitivities", lambda _base: "shared")
     monkeypatch.setattr(find_addition, "joint_parameters", lambda *_: [(CLEAR,)])
     monkeypatch.setattr(find_addition, "established_effects", lambda *_: [True])
-    monkeypatch.setattr(find_addition, "errors_beside_nominal_values", lambda *_: (np.full(4, 25.0), np.full(4, 23.0)))
     plain = finding
     monkeypatch.setitem(globals(), "finding", lambda *a, **k: replace(plain(*a, **k), family="measurement"))
     made = procedure()
+    made.context.beside_nominal = lambda base: BeforeAndAfter(base, 100.0, 92.0)
     made.record.beside_impacts = beside_impacts
     (best, _), _ = searched(
         monkeypatch, made, {"a": (gain, True)}, np.zeros(10), 1.0, step=0, base=node(1.0), refitted=0.0, explained=True
     )
     assert (None if best is None else best.name) == added
+
+
+@pytest.mark.parametrize(
+    ("ratio", "step", "before", "after", "added"),
+    [
+        (1.9, 0, 1.8, 1.79, False),  # nominal values explain as much
+        (1.9, 0, 1.8, 1.7, True),  # 11 % beyond them
+        (1.9, 0, 1.05, 1.0, False),  # 9 %: so near to noise an effect must remove 12.5 %
+        (1.9, 0, 1.05, 0.97, True),
+        (2.1, 0, 1.05, 1.05, True),  # far off: many nominal values near their bounds at once are less plausible
+        (2.1, 1, 1.05, 1.0, False),  # what an effect left
+        (2.1, 1, 1.2, 1.2, True),  # nominal values leave more than noise of it
+    ],
+)
+def test_an_effect_on_a_small_remainder_must_explain_more_than_nominal_values(
+    monkeypatch, ratio, step, before, after, added
+):
+    made = procedure()
+
+    def comparison(base):
+        return Comparison(base, {"base": np.full(4, before**2 / 4), "a": np.full(4, after**2 / 4)})
+
+    made.context.beside_nominal = comparison
+    base = node(ratio, name="base")
+    best, _ = searched(
+        monkeypatch, made, {"a": (0.5, True)}, np.zeros(10), base=base, step=step, refitted=0.0, beside_nominal=True
+    )[0]
+    assert (best is not None) is added
+    (found,) = made.record.findings
+    assert found.accepted is added
+    assert found.reason == ("" if added else "explains little beyond nominal values within their tolerance")
+
+
+@pytest.mark.parametrize("decides", [True, False])
+def test_candidates_are_promoted_and_compared_beside_nominal_values_where_that_is_asked_for(monkeypatch, decides):
+    made, promoted, compared = procedure(), [], []
+
+    class Asked(Comparison):
+        def promoted(self, screened, cfg):
+            promoted.append((screened, cfg.min_gain))
+            return screened
+
+    made.context.beside_nominal = lambda base: Asked(base, decides=decides)
+    searched(monkeypatch, made, {"a": (0.5, True)}, np.zeros(10), 3.0, beside_nominal=True)
+    assert promoted == [(["s1", "s2", "s3"], made.context.cfg.min_gain)]
+
+    def group(_base, accepted, *rest):
+        compared.append(rest[-1])
+        return accepted
+
+    monkeypatch.setattr(find_addition, "group_indistinguishable", group)
+    made.additions.finder.find(node(3.0), 0, beside_nominal=True)
+    assert (compared[0] is not None) is decides
+    made.additions.finder.find(node(3.0), 0)
+    assert compared[1] is None
+    assert len(promoted) == 2
 
 
 class Parts:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,22 +13,18 @@ from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search import nominal_values
 from concent_warp.diagnosis.search.nominal_values import (
-    NominalSensitivities,
     _independent,
     _visible,
     considered_std,
-    errors_beside_nominal_values,
     nominal_errors,
     nominal_sensitivities,
     possible_nominal_effects,
     with_nominal_values,
 )
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums, cut_blocks
-from concent_warp.fit.effects.least_squares import Linear, Solver
+from concent_warp.fit.effects.least_squares import Solver
 from tests.scenes.foreign import PUSHER, pusher
 from tests.scenes.swinging import drawing, swung, windows_of
 
@@ -68,35 +63,6 @@ def test_a_nominal_value_whose_error_would_show_counts_by_what_may_go_unseen():
         found = considered_std(j, k, excess, 10.0)
         assert found == pytest.approx([0.3 / np.sqrt(1 + change / excess)], rel=1e-2)
     assert considered_std(j, k, 1e9, 10.0) == pytest.approx([0.3], rel=1e-2)
-
-
-def test_what_nominal_values_take_up_is_no_gain_of_an_effect(monkeypatch):
-    rng = np.random.default_rng(3)
-    like, other, noise = rng.normal(size=(3, 1200))
-    kind, own = SimpleNamespace(name="length", target=("arm",)), SimpleNamespace(name="mass", target=("arm",))
-    shared = NominalSensitivities((("length", "arm"), ("mass", "arm")), np.stack([5.0 * like, 5.0 * other], axis=1))
-    window = SimpleNamespace(start=0.0, end=12.0, number=0, clock=np.arange(1200) / 100)
-    blocks = cut_blocks([window])  # pyright: ignore[reportArgumentType]
-    monkeypatch.setattr(nominal_values, "possible_nominal_effects", lambda model: model.kinds)
-
-    def removed(column, kinds, fitted=()):
-        residual = noise + 0.5 * column
-        base, candidate = (
-            SimpleNamespace(
-                model=SimpleNamespace(effects=list(fitted), kinds=of), blocks=blocks, limit=4.0,
-                cfg=EffectSolverCfg(), pieces=[Linear(left, np.zeros((1200, len(fitted))))],
-            )
-            for of, left in ((kinds, residual), (kinds[:1], noise))
-        )  # fmt: skip
-        before, after = errors_beside_nominal_values(base, candidate, shared)  # pyright: ignore[reportArgumentType]
-        return 1 - after.sum() / before.sum()
-
-    assert removed(like, [kind, own]) < 0.01
-    assert removed(other, [kind]) == pytest.approx(0.2, abs=0.05)
-    assert removed(other, [kind, own]) < 0.01
-    # One that the model has is fitted already.
-    present = SimpleNamespace(effect=SimpleNamespace(name="length", nominal=True), values=(1.0,))
-    assert removed(like, [kind], [present]) == pytest.approx(0.2, abs=0.05)
 
 
 def test_a_nominal_value_is_not_considered_beside_the_effect_that_it_is():
@@ -175,7 +141,7 @@ def fits(monkeypatch):
 
 def test_nominal_values_are_fitted_only_where_a_linear_step_promises_a_share_of_the_least_gain(slightly_wrong, fits):
     cfg = NominalCfg()
-    visible, promised = _visible(slightly_wrong, cfg)
+    visible, promised = _visible(slightly_wrong, cfg, nominal_sensitivities(slightly_wrong))
     assert 0.6 < promised < 0.8
     assert cfg.promised_share == 0.5
     fits.clear()
