@@ -296,7 +296,7 @@ class NominalCfg:
     min_change: Positive = 0.1
     """Change of the predictions within the tolerance from which on a value is fitted: RMS over the noise, initial
     states fitted [-]. In squares, 1 % of what the noise itself leaves."""
-    max_values: Count = 16
+    max_values: Count = 24
     """Most values that are fitted, the most visible ones. Empirical."""
     promised_share: Share = 0.5
     """Share of the least gain that a linear step must promise, or the values are not fitted [-]: within the tolerance
@@ -304,6 +304,9 @@ class NominalCfg:
     bounded_ratio: Positive = 1.1
     """Noise ratio up to which a fit with values at their bounds counts [-]; where more is left, something larger than a
     tolerance is missing. That of `SearchCfg.explained_ratio`."""
+    max_bounded_share: Share = 0.5
+    """Share of the fitted values that may be at their bounds where an error in the formula of an effect is left [-]:
+    more at once are less plausible than something that is missing. Empirical."""
 
 
 @dataclass(frozen=True)

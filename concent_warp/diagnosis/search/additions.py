@@ -276,7 +276,7 @@ class Additions:
             with_step: Whether to try a shorter time step beside them.
         """
         context, holding = self.context, self.context.record.holding
-        found = context.nominal_fit(one)
+        found = context.nominal_fit(one, dependent=enough is not None)
         if found is None:
             return None
         held = self.with_holding(found)

@@ -144,11 +144,12 @@ class SearchContext:
         found = self.nominal_fit(one)
         return found if found is not None and stays_within(found, self.cfg.nominal) else None
 
-    def nominal_fit(self, one: FittedModel) -> FittedModel | None:
+    def nominal_fit(self, one: FittedModel, *, dependent: bool = False) -> FittedModel | None:
         """Return a fitted model with nominal values up to their bounds, None where that explains nothing more.
 
         Args:
             one: The fitted model.
+            dependent: See `with_nominal_values`.
         """
         if not self.cfg.nominal.enabled or nominal_effects(one.model):
             return None
@@ -157,7 +158,8 @@ class SearchContext:
         beside = self.beside_nominal(one)
         if beside is None:
             return None
-        fit = partial(with_nominal_values, one, self.cfg.nominal, self.least_gain(one), beside.sensitivities)
+        least = self.least_gain(one)
+        fit = partial(with_nominal_values, one, self.cfg.nominal, least, beside.sensitivities, dependent)
         return self.budget.attempt(fit, None, unsettled)
 
     def beside_nominal(self, base: FittedModel) -> BesideNominalValues | None:

@@ -19,7 +19,11 @@ from concent_warp.model import Model
 
 
 def with_nominal_values(
-    base: FittedModel, cfg: NominalCfg, min_gain: float, sensitivities: NominalSensitivities | None = None
+    base: FittedModel,
+    cfg: NominalCfg,
+    min_gain: float,
+    sensitivities: NominalSensitivities | None = None,
+    dependent: bool = False,
 ) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
@@ -30,22 +34,33 @@ def with_nominal_values(
         cfg: Settings.
         min_gain: Share of the held-out error that they must remove [-].
         sensitivities: Those of the model to its nominal values; by default they are simulated.
+        dependent: Whether those that others can stand in for are fitted, too, where one of these runs to its bound and
+            more than noise is left. Many values near their bounds at once are less plausible than an effect that is
+            missing, and more plausible than another one beside an effect.
     """
-    visible, promised = _visible(base, cfg, sensitivities or nominal_sensitivities(base))
+    visible, promised = _visible(base, cfg, sensitivities := sensitivities or nominal_sensitivities(base))
     if not visible or promised < cfg.promised_share * min_gain:
         return None
-    compiled = base.model.compile()
-    added = [AddedEffect(e, tuple(p.null for p in e.parameters(compiled))) for e in visible]
-    solver = replace(base, model=replace(base.model, effects=(*added, *base.model.effects))).solver()
-    nominal = len(solver.p.start) - len(base.fit.values)
-    start = np.concatenate([solver.p.start[:nominal], base.fit.values])
-    # Within the tolerance residuals are in proportion to the values: no polish is needed.
-    fit = solver.fit(start, base.fit.offsets, base.fit.starts)
-    found = fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
+    found = _fitted(base, visible)
+    if dependent and not stays_within(found, cfg):
+        visible, _ = _visible(base, cfg, sensitivities, independent=False)
+        found = min(found, _fitted(base, visible), key=lambda one: one.fit.cost)
     sums, prior = block_sums(found.pieces, found.blocks, base.limit), base.cfg.least_squares.prior
     # Here the values themselves are judged: each fold is predicted from those of the others.
     errors = HeldOut(sums, found.blocks, prior).of_fit()
     return found if errors.sum() <= (1 - min_gain) * base.errors.sum() else None
+
+
+def _fitted(base: FittedModel, nominal: Sequence[Effect]) -> FittedModel:
+    """Return a fitted model with nominal values, all fitted together."""
+    compiled = base.model.compile()
+    added = [AddedEffect(e, tuple(p.null for p in e.parameters(compiled))) for e in nominal]
+    solver = replace(base, model=replace(base.model, effects=(*added, *base.model.effects))).solver()
+    count = len(solver.p.start) - len(base.fit.values)
+    start = np.concatenate([solver.p.start[:count], base.fit.values])
+    # Within the tolerance residuals are in proportion to the values: no polish is needed.
+    fit = solver.fit(start, base.fit.offsets, base.fit.starts)
+    return fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
 
 
 def stays_within(found: FittedModel, cfg: NominalCfg, enough: Callable[[FittedModel], bool] | None = None) -> bool:
@@ -56,10 +71,13 @@ def stays_within(found: FittedModel, cfg: NominalCfg, enough: Callable[[FittedMo
     Args:
         found: The fitted model with nominal values.
         cfg: Settings.
-        enough: Whether a model with values at their bounds leaves little enough; by default `NominalCfg.bounded_ratio`.
+        enough: Whether a model with up to `NominalCfg.max_bounded_share` of its values at their bounds leaves little
+            enough; by default `NominalCfg.bounded_ratio`.
     """
-    little = found.ratio <= cfg.bounded_ratio or (enough is not None and enough(found))
-    return little or not has_bounded_nominal_values(found.model)
+    share = bounded_share(found.model)
+    if not share or found.ratio <= cfg.bounded_ratio:
+        return True
+    return enough is not None and share <= cfg.max_bounded_share and enough(found)
 
 
 def nominal_effects(model: Model) -> list[int]:
@@ -69,13 +87,19 @@ def nominal_effects(model: Model) -> list[int]:
 
 def has_bounded_nominal_values(model: Model) -> bool:
     """Return whether a nominal value of a model is at its bound."""
+    return bounded_share(model) > 0
+
+
+def bounded_share(model: Model) -> float:
+    """Return which share of a model's nominal values are at their bounds, 0..1; 0 where it has none."""
     plain = replace(model, effects=()).compile()
-    return any(
+    bounded = [
         FittedParameter.within(p, value, 0.0).at_bound
         for added in model.effects
         if added.effect.nominal
         for p, value in zip(added.effect.parameters(plain), added.values, strict=True)
-    )
+    ]
+    return float(np.mean(bounded)) if bounded else 0.0
 
 
 def without_nominal_values(last: FittedModel) -> FittedModel:
@@ -188,11 +212,13 @@ def _sensitivities(base: FittedModel, kinds: Sequence[Effect]) -> list[np.ndarra
     return [np.hstack(of_window) for of_window in zip(*columns, strict=True)]
 
 
-def _visible(base: FittedModel, cfg: NominalCfg, sensitivities: NominalSensitivities) -> tuple[list[Effect], float]:
+def _visible(
+    base: FittedModel, cfg: NominalCfg, sensitivities: NominalSensitivities, *, independent: bool = True
+) -> tuple[list[Effect], float]:
     """Return the nominal values that change the predictions measurably within their tolerance, as effects.
 
-    Values whose changes the others can produce are left out, the least visible first. With them comes the share of the
-    held-out error that a linear step within their prior promises to remove.
+    Independent ones are those whose changes others cannot produce, the most visible first. With them comes the share of
+    the held-out error that a linear step within their prior promises to remove.
     """
     present = {a.effect.name for a in base.model.effects}
     kinds = [e for e in possible_nominal_effects(base.model) if e.name not in present]
@@ -201,7 +227,7 @@ def _visible(base: FittedModel, cfg: NominalCfg, sensitivities: NominalSensitivi
     owners = [(effect, target) for effect in kinds for target in effect.target]
     columns, prior = sensitivities.of(kinds), base.cfg.least_squares.prior
     by_window = np.split(columns, np.cumsum([len(piece.residual) for piece in base.pieces])[:-1])
-    chosen = _independent(columns, cfg)
+    chosen = _independent(columns, cfg) if independent else _most_visible(columns, cfg)
     seen = [
         replace(piece, jacobian=np.hstack([piece.jacobian, np.nan_to_num(of[:, chosen]) / prior]))
         for piece, of in zip(base.pieces, by_window, strict=True)
@@ -217,6 +243,13 @@ def _visible(base: FittedModel, cfg: NominalCfg, sensitivities: NominalSensitivi
         if names:
             found.append(type(effect)(*names))
     return found, promised
+
+
+def _most_visible(columns: np.ndarray, cfg: NominalCfg) -> list[int]:
+    """Return which columns (n, K) change the residuals by more than `min_change`, the most visible first."""
+    sizes = np.linalg.norm(np.nan_to_num(columns, posinf=0.0, neginf=0.0), axis=0)
+    order = np.argsort(-sizes, kind="stable")
+    return [int(k) for k in order if sizes[k] >= cfg.min_change * np.sqrt(len(columns))][: cfg.max_values]
 
 
 def _independent(columns: np.ndarray, cfg: NominalCfg) -> list[int]:

@@ -195,8 +195,8 @@ def test_over_short_windows_no_further_effect_is_tried_on_an_error_of_form(monke
 def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
     given, after, asked = node(5.0), node(2.0, effects=1), []
 
-    def nominal(one, cfg, min_gain, sensitivities):
-        assert sensitivities == "shared"
+    def nominal(one, cfg, min_gain, sensitivities, dependent):
+        assert (sensitivities, dependent) == ("shared", one is after)
         # Far from the noise they must explain a fifth; as near as an error of form leaves, what an effect must.
         assert (cfg, min_gain) == (made.context.cfg.nominal, 0.2 if one is given else 0.04)
         return one

@@ -160,7 +160,7 @@ def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any)
     nodes = [node(3.0), node(1.5, effects=1), node(1.0, effects=1)]
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
-    monkeypatch.setattr(made.context, "nominal_fit", lambda *_: None)
+    monkeypatch.setattr(made.context, "nominal_fit", lambda *_, **__: None)
     monkeypatch.setattr(made.additions.finder, "find", lambda *_, **__: (nodes[1], ()))
     monkeypatch.setattr(
         additions, "hold", lambda one, known, _cfg: asked.append((one, known)) or (nodes[2], ("joints",))
@@ -169,7 +169,7 @@ def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any)
     assert asked == [(nodes[1], ())]
     assert made.record.holding == ("joints",)
     alone = procedure(max_additions=1)
-    monkeypatch.setattr(alone.context, "nominal_fit", lambda *_: None)
+    monkeypatch.setattr(alone.context, "nominal_fit", lambda *_, **__: None)
     monkeypatch.setattr(alone.additions.finder, "find", lambda *_, **__: (nodes[1], ()))
     assert alone.additions.add_effects(nodes[:1], (), effects_alone=True)[0] == nodes[:2]
     assert len(asked) == 1
@@ -181,7 +181,7 @@ def test_friction_that_holds_is_tried_before_an_effect_is_named_beside_little(mo
     given, held, better = node(1.0), node(0.9), node(0.95, effects=1)
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
-    monkeypatch.setattr(made.context, "nominal_fit", lambda *_: None)
+    monkeypatch.setattr(made.context, "nominal_fit", lambda *_, **__: None)
 
     def find(base, step, **_):
         found.append(base)

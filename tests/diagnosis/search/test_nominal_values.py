@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.search import nominal_values
 from concent_warp.diagnosis.search.nominal_values import (
     _independent,
     _visible,
@@ -20,8 +23,10 @@ from concent_warp.diagnosis.search.nominal_values import (
     nominal_errors,
     nominal_sensitivities,
     possible_nominal_effects,
+    stays_within,
     with_nominal_values,
 )
+from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums, cut_blocks
 from concent_warp.fit.effects.least_squares import Solver
@@ -166,6 +171,43 @@ def test_nominal_values_that_remove_less_than_the_least_gain_stay_as_given(sligh
     assert 0.6 < removed < 0.8
     assert with_nominal_values(slightly_wrong, NominalCfg(), 0.99 * removed) is not None
     assert with_nominal_values(slightly_wrong, NominalCfg(), 1.01 * removed) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "ratio", "enough", "within"),
+    [
+        ((1.0, 1.01), 3.0, None, True),
+        ((1.02, 1.0), 3.0, None, False),
+        ((1.02, 1.0), 1.09, None, True),  # little more than noise is left
+        ((1.02, 1.0), 1.11, None, False),
+        ((1.02, 1.0), 3.0, True, True),  # beside an effect, with an error in its formula
+        ((1.02, 1.0), 3.0, False, False),
+        ((1.02, 0.98), 3.0, True, False),  # more than half of them at once
+        ((1.02, 0.98), 1.09, True, True),
+    ],
+)
+def test_something_larger_is_missing_where_values_run_to_their_bounds(values, ratio, enough, within):
+    model = cw.Model(cw.Scene(PUSHER))
+    gains = next(e for e in possible_nominal_effects(model) if e.name == "nominal_gain")
+    one: Any = SimpleNamespace(model=replace(model, effects=(AddedEffect(gains, values),)), ratio=ratio)
+    assert stays_within(one, NominalCfg(), None if enough is None else lambda _: enough) is within
+
+
+@pytest.mark.parametrize("at_bound", [True, False])
+def test_values_that_others_stand_in_for_are_fitted_where_one_of_these_runs_to_its_bound(
+    slightly_wrong, fits, monkeypatch, at_bound
+):
+    monkeypatch.setattr(nominal_values, "stays_within", lambda *_: not at_bound)
+    plain = with_nominal_values(slightly_wrong, NominalCfg(), 0.05, None, False)
+    assert len(fits) == 1
+    found = with_nominal_values(slightly_wrong, NominalCfg(), 0.05, None, True)
+    assert plain is not None
+    assert found is not None
+    assert len(fits) == (3 if at_bound else 2)
+    names = [{(a.effect.name, t) for a in one.model.effects for t in a.effect.target} for one in (plain, found)]
+    assert (names[0] < names[1]) is at_bound
+    assert (found.fit.cost < plain.fit.cost) is at_bound
+    assert len(names[1]) <= NominalCfg().max_values
 
 
 def test_what_a_fit_of_nominal_values_could_not_take_does_not_count(slightly_wrong, monkeypatch):
