@@ -257,7 +257,7 @@ class Additions:
         """
         enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
         both = None if finer is None else self._nominal(finer, enough)
-        plain = self._nominal(fitted[-1], enough, with_step=finer is None)
+        plain = self._nominal(fitted[-1], enough, with_step=len(fitted) > 1 and finer is None)
         if finer is not None and both is not None and (plain is None or self._needs_step(plain, both)):
             return [*self._adopt(fitted, finer)[:-1], both]
         return None if plain is None else [*fitted[:-1], plain]

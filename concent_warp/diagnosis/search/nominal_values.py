@@ -74,8 +74,7 @@ def stays_within(found: FittedModel, cfg: NominalCfg, enough: Callable[[FittedMo
         enough: Whether a model with up to `NominalCfg.max_bounded_share` of its values at their bounds leaves little
             enough; by default `NominalCfg.bounded_ratio`.
     """
-    share = bounded_share(found.model)
-    if not share or found.ratio <= cfg.bounded_ratio:
+    if found.ratio <= cfg.bounded_ratio or not (share := bounded_share(found.model)):
         return True
     return enough is not None and share <= cfg.max_bounded_share and enough(found)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.cfg import NominalCfg
-from concent_warp.diagnosis.search import additions, context
+from concent_warp.diagnosis.search import additions, context, nominal_values
 from concent_warp.diagnosis.search.adequacy import is_lacking
 from concent_warp.effects.effect import Parameter
 from concent_warp.simulate.time_limit import TimeUpError
@@ -243,11 +243,16 @@ def test_friction_that_holds_and_a_shorter_time_step_are_tried_beside_nominal_va
         return nodes[held]
 
     monkeypatch.setattr(made.additions, "with_holding", with_holding)
-    found = made.additions._with_nominal([given], None, given)
-    assert found == (None if left is None else [nodes[left]])
+    after = node(4.0, 300.0, effects=1)
+    found = made.additions._with_nominal([given, after], None, given)
+    assert found == (None if left is None else [given, nodes[left]])
     assert made.record.holding == holding
     assert shortened == ([nodes[tried]] if tried else [])
     assert made.record.time_step == ((nodes[held], nodes["finer"]) if left == "finer" else None)
+    # Of the model as given, values at their bounds and a shorter time step at once are less plausible than an effect.
+    shortened.clear()
+    made.additions._with_nominal([given], None, given)
+    assert not shortened
 
 
 @pytest.mark.parametrize(
@@ -285,7 +290,8 @@ def test_an_effect_that_explains_more_comes_before_nominal_values_at_their_bound
     monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
     monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
     monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
-    monkeypatch.setattr(additions, "has_bounded_nominal_values", lambda model: at_bounds and model is bounded.model)
+    share = {id(bounded.model): 0.5 if at_bounds else 0.0}
+    monkeypatch.setattr(nominal_values, "bounded_share", lambda model: share.get(id(model), 0.0))
     monkeypatch.setattr(context, "with_nominal_values", lambda one, *_: bounded if one is finer else None)
     fitted, _ = made.additions.add_effects([given, after], ())
     assert [base for base, _ in calls].count(after) == asked
@@ -328,7 +334,7 @@ def test_nominal_values_at_their_bounds_stay_where_there_is_no_time_to_look_for_
 
     monkeypatch.setattr(made.additions.finder, "find", late)
     monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
-    monkeypatch.setattr(additions, "has_bounded_nominal_values", lambda _: True)
+    monkeypatch.setattr(nominal_values, "bounded_share", lambda _: 0.5)
     monkeypatch.setattr(context, "with_nominal_values", lambda *_: bounded)
     assert made.additions.add_effects([given, after], ()) == ([given, bounded], ())
     assert made.context.budget.cut == {1}
