@@ -159,7 +159,10 @@ def test_termination_leaves_no_files_of_parallel_processes(tmp_path):
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 143
-    assert err == "\nconcent diagnose: terminated.\n"
+    # joblib's process that removes what the others leave may say what it found, where it comes before them.
+    said, *found = err.split("\n/")
+    assert said.removesuffix("\n") == "\nconcent diagnose: terminated."
+    assert all("resource_tracker" in warning for warning in found)
     end = time.monotonic() + 20
     while shared() and time.monotonic() < end:
         time.sleep(0.1)

@@ -115,7 +115,7 @@ def test_where_what_is_left_may_be_an_error_of_a_formula_one_more_effect_is_trie
     for left, explained in ((1.09, True), (1.2, True), (1.9, True), (2.1, False)):
         made, asked = procedure(), []
 
-        def find(_base, step, *, explained, asked=asked, left=left):
+        def find(_base, step, *, explained, asked=asked, left=left, **_):
             asked.append(explained)
             return (None if step else node(left, effects=1)), ()
 
