@@ -104,7 +104,7 @@ def test_checkpoints_that_take_long_are_written_less_often(teacher, tmp_path, mo
         written.append(path.name)
 
     monkeypatch.setattr(Samples, "save", slow)
-    # So many that the one after them is due even where the disk is busy as the first, without samples, is written.
+    # The first checkpoint, without samples, is slow on a busy disk: after so many iterations one with samples is due.
     often = replace(TINY, checkpoint=1e-3, dagger=replace(TINY.dagger, iterations=20, updates=1))
     cw.distil(teacher, often, device="cpu", out=tmp_path / "student")
     assert len(written) == 1

@@ -22,13 +22,13 @@ Pair = tuple[FittedCandidate, Finding]
 
 def group_indistinguishable(
     base: FittedModel,
-    accepted: Sequence[tuple[FittedCandidate, Finding]],
+    accepted: Sequence[Pair],
     assess: Callable[[FittedCandidate], Finding],
     runner: TaskRunner,
     cfg: DiagnoseCfg,
     budget: TimeBudget | None = None,
     compare: Callable[[FittedModel | FittedCandidate], np.ndarray] | None = None,
-) -> list[tuple[FittedCandidate, Finding]]:
+) -> list[Pair]:
     """Return the accepted candidates that cannot be distinguished from the best, the most plausible first.
 
     The first one is polished. Where more candidates are nearly equal, the profile likelihoods of their parameters are
@@ -51,7 +51,7 @@ def group_indistinguishable(
         unsettled = f"Left out of the comparison: the profile likelihood of {c.effect.name}."
         return budget.attempt(lambda: refine_by_profile(base, c, runner, cfg.profile), c, unsettled)
 
-    def with_evidence(c: FittedCandidate) -> tuple[FittedCandidate, Finding]:
+    def with_evidence(c: FittedCandidate) -> Pair:
         # An accepted effect stays accepted: its gain is the evidence, even where a rough cost widens its interval.
         return c, replace(assess(c), accepted=True, reason="")
 

@@ -132,6 +132,7 @@ class AdditionFinder:
             unsettled = "Open: whether other initial states let the model explain more without an effect."
             base = context.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
             findings = [finding(c) for c in fitted]
+        # Of the base as it is now: its initial states may have been fitted anew.
         wanted = (explained or beside_nominal) and any(f.accepted for f in findings)
         beside = context.beside_nominal(base) if wanted else None
         if explained:
