@@ -157,6 +157,9 @@ class AdditionFinder:
         group = group_indistinguishable(base, accepted, finding, context.runner, cfg, context.budget, compare)
         context.record.rivals[step] = near_best(base, fitted, findings, cfg)
         best = group[0][0]
+        if compare is not None:
+            most, reason = group[0][1].gain, "another one explains more beside nominal values"
+            findings = [replace(f, reason=reason) if f.accepted and f.gain > most else f for f in findings]
         context.record.add(group, findings, profile_widening(base, best))
         if best.std is None:
             context.record.unprofiled[step] = base, best

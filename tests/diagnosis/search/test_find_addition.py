@@ -246,15 +246,10 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
         assert len(compared) == explained
 
 
-class BeforeAndAfter(Comparison):
-    """Of a model and of all candidates the same is left beside nominal values."""
-
-    def __init__(self, base, before, after):
-        super().__init__(base)
-        self.before, self.after = (np.full(4, error / 4) for error in (before, after))
-
-    def errors(self, one):
-        return self.before if one is self.base else self.after
+def leaving(before: float, after: float) -> Any:
+    """Return what finds that so much is left beside nominal values of the model, and of the candidate "a"."""
+    left = {"": np.full(4, before / 4), "a": np.full(4, after / 4)}
+    return lambda base: Comparison(base, left)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +272,7 @@ def test_a_small_effect_on_the_model_as_given_counts_where_nominal_values_do_not
     monkeypatch.setattr(find_addition, "joint_parameters", lambda *_: [(CLEAR,)])
     monkeypatch.setattr(find_addition, "established_effects", lambda *_: [True])
     made = procedure()
-    made.context.beside_nominal = lambda base: BeforeAndAfter(base, *beside)
+    made.context.beside_nominal = leaving(*beside)
     made.record.beside_impacts, step = step < 0, max(step, 0)
     (best, _), asked = searched(
         monkeypatch, made, {"a": (gain, True)}, np.zeros(10), 1.0, step=step, base=node(1.0, nominal=nominal),
@@ -300,7 +295,7 @@ def test_a_small_effect_of_a_sensor_counts_only_beside_errors_of_impacts(monkeyp
     plain = finding
     monkeypatch.setitem(globals(), "finding", lambda *a, **k: replace(plain(*a, **k), family="measurement"))
     made = procedure()
-    made.context.beside_nominal = lambda base: BeforeAndAfter(base, 100.0, 92.0)
+    made.context.beside_nominal = leaving(100.0, 92.0)
     made.record.beside_impacts = beside_impacts
     (best, _), _ = searched(
         monkeypatch, made, {"a": (gain, True)}, np.zeros(10), 1.0, step=0, base=node(1.0), refitted=0.0, explained=True
@@ -324,14 +319,9 @@ def test_an_effect_on_a_small_remainder_must_explain_more_than_nominal_values(
     monkeypatch, ratio, step, before, after, added
 ):
     made = procedure()
-
-    def comparison(base):
-        return Comparison(base, {"base": np.full(4, before**2 / 4), "a": np.full(4, after**2 / 4)})
-
-    made.context.beside_nominal = comparison
-    base = node(ratio, name="base")
+    made.context.beside_nominal = leaving(before**2, after**2)
     best, _ = searched(
-        monkeypatch, made, {"a": (0.5, True)}, np.zeros(10), base=base, step=step, refitted=0.0, beside_nominal=True
+        monkeypatch, made, {"a": (0.5, True)}, np.zeros(10), ratio, step, refitted=0.0, beside_nominal=True
     )[0]
     assert (best is not None) is added
     (found,) = made.record.findings
@@ -349,16 +339,27 @@ def test_candidates_are_promoted_and_compared_beside_nominal_values_where_that_i
             return screened
 
     made.context.beside_nominal = lambda base: Asked(base, decides=decides)
-    searched(monkeypatch, made, {"a": (0.5, True)}, np.zeros(10), 3.0, beside_nominal=True)
+    searched(
+        monkeypatch,
+        made,
+        {"a": (0.5, True), "b": (0.6, True), "c": (0.4, True)},
+        np.zeros(10),
+        3.0,
+        beside_nominal=True,
+    )
+    made.record.forget(0, 0)
     assert promoted == [(["s1", "s2", "s3"], made.context.cfg.min_gain)]
 
     def group(_base, accepted, *rest):
         compared.append(rest[-1])
-        return accepted
+        return accepted[:1]
 
     monkeypatch.setattr(find_addition, "group_indistinguishable", group)
     made.additions.finder.find(node(3.0), 0, beside_nominal=True)
     assert (compared[0] is not None) is decides
+    found = {f.name: (f.accepted, f.reason) for f in made.record.findings}
+    more = "another one explains more"
+    assert found == {"a": (True, ""), "b": (False, more + " beside nominal values" * decides), "c": (False, more)}
     made.additions.finder.find(node(3.0), 0)
     assert compared[1] is None
     assert len(promoted) == 2
