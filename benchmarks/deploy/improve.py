@@ -18,6 +18,7 @@ from queue import Queue
 from statistics import mean, median
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 import tyro
 from scipy.stats import wilcoxon
@@ -58,6 +59,10 @@ WIDE: Mapping[str, Any] = {
     "environment.randomisation.delay": (0.0, 0.2), "environment.randomisation.lag": (0.0, 0.25),
 }  # fmt: skip
 """Wide randomisation, which includes most of the hidden effects."""
+UNHIDDEN = 0.996
+"""Success of policies where nothing is hidden, that of the page on trials."""
+BOOTSTRAPS = 10_000
+"""Draws of seeds for the interval of a recovered share."""
 BOUNDS = (0.4, 0.8)
 """Success rates of the given policy for which a case counts."""
 INTRODUCTION = """\
@@ -74,6 +79,7 @@ at once.
 """
 SUMMARY = ["arm", "succeed", "95 %", "share of *true effect*: median, smallest of a case and seed"]
 TRAININGS = ["hidden effect", "seeds", "before", "randomised", "true effect", "true effect is above", "p"]
+RECOVERED = ["hidden effect", "seeds", "costs", "randomised recovers", "true effect recovers"]
 NOTES = """\
 Rounds of 50 iterations of 4,096 worlds, half of those that the given policy was trained for. Two of the effects were
 measured, with magnitudes under which that policy succeeds in about half of 60 trials of other seeds; some seeds of the
@@ -287,6 +293,10 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
         "have all three: mean, smallest and largest success. *p*: of *true effect* against *randomised*, seeds in "
         "pairs, signed-rank test.",
         table(TRAININGS, _trainings(rates)),
+        f"What the effect costs the given policy, of the {UNHIDDEN:.1%} of [trials](train_trials.md) in which policies "
+        "trained by default settings succeed where nothing is hidden (seeds 40 to 49), and which share of it the same "
+        "trainings give back, over these seeds together: with 95 % intervals, bootstrapped over seeds in pairs.",
+        table(RECOVERED, _recovered(rates)),
         "## Against other trainings", f"{len(counted)} of {len(whole)} cases and seeds with all arms count.",
         table(SUMMARY, _summary(rows, counted)) if counted else "",
     ]  # fmt: skip
@@ -337,6 +347,26 @@ def _trainings(rates: Mapping[tuple[str, int], Mapping[str, float]]) -> list[lis
         gain = [of["true effect"] - of["randomised"] for of in mine]
         above, test = sum(one > 0 for one in gain), _signed_rank(gain)
         lines.append([case, str(len(mine)), *cells, f"{above} of {len(mine)}", f"{test:.2g}"])
+    return lines
+
+
+def _recovered(rates: Mapping[tuple[str, int], Mapping[str, float]]) -> list[list[str]]:
+    """Return what an effect costs the given policy, and which share of it two trainings give back, a line a case."""
+    lines, arms = [], ("before", *reversed(OTHERS))
+    for case in dict.fromkeys(case for case, _ in rates):
+        mine = [[of[arm] for arm in arms] for (name, _), of in rates.items() if name == case and set(arms) <= set(of)]
+        if len(mine) < 2:
+            continue
+        drawn = np.random.default_rng(0).integers(len(mine), size=(BOOTSTRAPS, len(mine)))
+        means = np.array(mine)[drawn].mean(axis=1)
+        cells = []
+        for k in (1, 2):
+            shares = (means[:, k] - means[:, 0]) / (UNHIDDEN - means[:, 0])
+            before, after = np.mean(mine, axis=0)[[0, k]]
+            low, high = np.quantile(shares, (0.025, 0.975))
+            cells.append(f"{(after - before) / (UNHIDDEN - before):.0%} [{low:.0%}, {high:.0%}]")
+        cost = UNHIDDEN - mean(row[0] for row in mine)
+        lines.append([case, str(len(mine)), f"{100 * cost:.1f} points", *cells])
     return lines
 
 
