@@ -33,7 +33,7 @@ def add_stribeck_friction(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values:
 
 
 def add_load_friction(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
-    """Add friction loss in proportion to the load: c |tau_m - tau_e| / 2.
+    """Add friction loss in proportion to the load: c (|tau_m| + |tau_e|) / 2.
 
     Args:
         m: Model whose `dof_frictionloss` has one row a world.
@@ -195,7 +195,7 @@ def load_kernel(
     """
     world, i = wp.tid()
     row = dof[i]
-    carried = 0.5 * wp.abs(actuator[world, row] + bias[world, row])
+    carried = 0.5 * (wp.abs(actuator[world, row]) + wp.abs(bias[world, row]))
     frictionloss[world, row] += wp.max(values[world, i], 0.0) * carried
 
 

@@ -112,7 +112,7 @@ def add_stribeck(begun: bool, whole: Numbers, real: Numbers, state: StepState) -
 def add_load(begun: bool, whole: Numbers, real: Numbers, state: StepState) -> None:  # noqa: ARG001
     """Add to the friction loss of whole[0]; the number is half the coefficient."""
     dof = whole[0]
-    state.dof_frictionloss[dof] += real[0] * abs(state.qfrc_actuator[dof] + state.qfrc_bias[dof])
+    state.dof_frictionloss[dof] += real[0] * (abs(state.qfrc_actuator[dof]) + abs(state.qfrc_bias[dof]))
 
 
 @inlined

@@ -237,12 +237,12 @@ def test_stribeck_friction_of_no_extra_or_no_speed_is_that_of_the_joint_in_motio
     np.testing.assert_allclose(m.dof_frictionloss, [0.3, 0.5], rtol=1e-12)
 
 
-def test_load_friction_adds_a_share_of_half_of_what_motor_and_weight_differ_by():
+def test_load_friction_adds_a_share_of_the_mean_of_what_motor_and_weight_exert():
     m = mujoco.MjModel.from_xml_string(TWO.format(gear=1, limits=""))
     d = mujoco.MjData(m)
     d.qpos[:], d.qvel[:], d.ctrl[:] = [0.3, 0.1], [0.4, -0.7], [2.0, 0.5]
     mujoco.mj_forward(m, d)
-    load = np.abs(d.qfrc_actuator + d.qfrc_bias) / 2
+    load = (np.abs(d.qfrc_actuator) + np.abs(d.qfrc_bias)) / 2
     assert (load > 0.5).all()
     LoadFriction(np.array([1, 0])).apply(m, d, np.array([0.3, -1.0]))
     np.testing.assert_allclose(m.dof_frictionloss, [0.3, 0.1 + 0.3 * load[1]], rtol=1e-12)

@@ -55,10 +55,11 @@ class StribeckFriction(DofForce):
 
 
 class LoadFriction(DofForce):
-    """Friction loss + c |tau_m - tau_e| / 2, of the step before; parameters are the c, shape (n,).
+    """Friction loss + c (|tau_m| + |tau_e|) / 2, of the step before; parameters are the c, shape (n,).
 
     tau_m is what the motor exerts, tau_e what the link's weight and motion do; in a static hold they are opposite, and
-    half their difference is the torque that the gears carry.
+    each is the torque that the gears carry. The source of `LoadDependentFriction` has their difference, or a
+    coefficient for each; their sum explains measured logs of a servo better (`benchmarks.diagnose.real`).
     """
 
     edits = ("dof_frictionloss",)

@@ -292,7 +292,9 @@ class LoadDependentFriction(DryFriction):
     """Friction that grows with the torque which the gears carry."""
 
     name = "load_friction"
-    summary = "Friction beyond the joint's own in proportion to the load between motor and link: c |tau_m - tau_e| / 2."
+    summary = (
+        "Friction beyond the joint's own in proportion to the load between motor and link: c (|tau_m| + |tau_e|) / 2."
+    )
     source = "Duclusaud, Passault, Padois, Daney: Extended friction models for the simulation of servo actuators, 2024"
     signature = "residual torque like -sign(velocity) |load|"
     confusions = ("joint_friction", "actuator_gain")
