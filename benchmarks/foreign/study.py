@@ -53,6 +53,7 @@ def main(args: Args) -> None:
     found = [case for case in all_cases() if case.name == args.name]
     if not found:
         raise SystemExit(f"foreign logs: no log is called {args.name}; python -m benchmarks.foreign --list prints all")
+    args.out.mkdir(parents=True, exist_ok=True)
     result = study(found[0], args.limit, args.cores) | {"commit": args.commit}
     write_text(path(args.out, args.name), json.dumps(result, allow_nan=False) + "\n")
 

@@ -69,6 +69,7 @@ class Args:
 def main(args: Args) -> None:
     """Diagnose one data set and keep the result."""
     (case,) = [c for c in all_sets() if c.name == args.name]
+    args.out.mkdir(parents=True, exist_ok=True)
     result = study(case, args.limit, args.cores, args.recordings) | {"commit": args.commit}
     write_text(path(args.out, case.name), json.dumps(result, allow_nan=False) + "\n")
 

@@ -301,7 +301,7 @@ class LoadDependentFriction(DryFriction):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one coefficient for each joint."""
-        return self.parameter_per_target("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
+        return self.parameter_per_target("coefficient", "-", 0.0, low=0.0, high=1.5, scale=0.1)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Friction loss that depends on load."""
