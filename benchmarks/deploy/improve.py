@@ -18,13 +18,13 @@ from queue import Queue
 from statistics import mean, median
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
 import tyro
 from scipy.stats import wilcoxon
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machines, table, write_page
+from benchmarks.train.hidden import rate, recovered, without_effect
 from concent_warp.deploy.cfg import EvaluateCfg
 from concent_warp.deploy.evaluate import evaluate
 from concent_warp.deploy.explain.cfg import ExplainCfg
@@ -59,10 +59,6 @@ WIDE: Mapping[str, Any] = {
     "environment.randomisation.delay": (0.0, 0.2), "environment.randomisation.lag": (0.0, 0.25),
 }  # fmt: skip
 """Wide randomisation, which includes most of the hidden effects."""
-UNHIDDEN = 0.996
-"""Success of policies where nothing is hidden, that of the page on trials."""
-BOOTSTRAPS = 10_000
-"""Draws of seeds for the interval of a recovered share."""
 BOUNDS = (0.4, 0.8)
 """Success rates of the given policy for which a case counts."""
 INTRODUCTION = """\
@@ -181,7 +177,7 @@ def main(args: Args) -> None:
                 longer(one[:2])
     rows = {name: row for name, row in kept.rows.items() if "error" not in row}
     if rows and args.data == Args.data:
-        write_page(NAME, page(rows))
+        write_page(NAME, page(rows, without_effect()))
 
 
 def _begin(devices: Queue[str | None]) -> None:
@@ -266,8 +262,13 @@ def true_model(policy: Policy, hidden: EvaluateCfg) -> Model:
     return model
 
 
-def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the page; a row without successes is of rounds whose last policy was not judged."""
+def page(rows: Mapping[str, Mapping[str, Any]], reference: float) -> str:
+    """Return the page; a row without successes is of rounds whose last policy was not judged.
+
+    Args:
+        rows: The results.
+        reference: Success of policies where nothing is hidden.
+    """
     rates: dict[tuple[str, int], dict[str, float]] = {}
     for row in rows.values():
         found = rates.setdefault((row["case"], row["seed"]), {})
@@ -293,10 +294,10 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
         "have all three: mean, smallest and largest success. *p*: of *true effect* against *randomised*, seeds in "
         "pairs, signed-rank test.",
         table(TRAININGS, _trainings(rates)),
-        f"What the effect costs the given policy, of the {UNHIDDEN:.1%} of [trials](train_trials.md) in which policies "
-        "trained by default settings succeed where nothing is hidden (seeds 40 to 49), and which share of it the same "
-        "trainings give back, over these seeds together: with 95 % intervals, bootstrapped over seeds in pairs.",
-        table(RECOVERED, _recovered(rates)),
+        f"What the effect costs the given policy, of the {reference:.1%} of [trials](train_trials.md) in which "
+        "policies trained by default settings succeed where nothing is hidden (seeds 40 to 49), and which share of it "
+        "the same trainings give back, as on the page of [hidden effects](train_hidden.md), over these seeds together.",
+        table(RECOVERED, _recovered(rows, reference)),
         "## Against other trainings", f"{len(counted)} of {len(whole)} cases and seeds with all arms count.",
         table(SUMMARY, _summary(rows, counted)) if counted else "",
     ]  # fmt: skip
@@ -350,23 +351,21 @@ def _trainings(rates: Mapping[tuple[str, int], Mapping[str, float]]) -> list[lis
     return lines
 
 
-def _recovered(rates: Mapping[tuple[str, int], Mapping[str, float]]) -> list[list[str]]:
+def _recovered(rows: Mapping[str, Mapping[str, Any]], reference: float) -> list[list[str]]:
     """Return what an effect costs the given policy, and which share of it two trainings give back, a line a case."""
-    lines, arms = [], ("before", *reversed(OTHERS))
-    for case in dict.fromkeys(case for case, _ in rates):
-        mine = [[of[arm] for arm in arms] for (name, _), of in rates.items() if name == case and set(arms) <= set(of)]
-        if len(mine) < 2:
+    lines: list[list[str]] = []
+    arms: tuple[Arm, ...] = ("before", *reversed(OTHERS))
+    for case in dict.fromkeys(row["case"] for row in rows.values()):
+        seeds = sorted({row["seed"] for row in rows.values() if row["case"] == case})
+        every = [[rows.get(key(case, seed, arm), {}) for arm in arms] for seed in seeds]
+        whole = [
+            [{**row, "episodes": row["trials"]} for row in of] for of in every if all("trials" in row for row in of)
+        ]
+        if not whole:
             continue
-        drawn = np.random.default_rng(0).integers(len(mine), size=(BOOTSTRAPS, len(mine)))
-        means = np.array(mine)[drawn].mean(axis=1)
-        cells = []
-        for k in (1, 2):
-            shares = (means[:, k] - means[:, 0]) / (UNHIDDEN - means[:, 0])
-            before, after = np.mean(mine, axis=0)[[0, k]]
-            low, high = np.quantile(shares, (0.025, 0.975))
-            cells.append(f"{(after - before) / (UNHIDDEN - before):.0%} [{low:.0%}, {high:.0%}]")
-        cost = UNHIDDEN - mean(row[0] for row in mine)
-        lines.append([case, str(len(mine)), f"{100 * cost:.1f} points", *cells])
+        cost = reference - mean(rate(of[0]) for of in whole)
+        shares = [recovered([(of[0], of[k]) for of in whole], reference) for k in (1, 2)]
+        lines.append([case, str(len(whole)), f"{100 * cost:.1f} points", *shares])
     return lines
 
 

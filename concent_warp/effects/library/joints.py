@@ -300,7 +300,7 @@ class LoadDependentFriction(DryFriction):
     confusions = ("joint_friction", "actuator_gain")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return one coefficient for each joint."""
+        """Return one coefficient for each joint, up to where a motor exerts 7 times the load that it drives."""
         return self.parameter_per_target("coefficient", "-", 0.0, low=0.0, high=1.5, scale=0.1)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
