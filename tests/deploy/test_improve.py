@@ -33,8 +33,13 @@ CFG = cw.ImproveCfg(
 
 
 @pytest.fixture(scope="module")
-def policy() -> cw.Policy:
-    return cw.load_policy("shape_sorter")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> cw.Policy:
+    """The policy that comes with the package, of whose training few initial states are sampled."""
+    shipped, folder = cw.load_policy("shape_sorter"), tmp_path_factory.mktemp("policy") / "shape_sorter"
+    shutil.copytree(shipped.folder, folder)
+    few = {"environment.reset.states": 20, "stress.episodes": 4}
+    with_settings(shipped.run.cfg, few).save(folder / "train.toml")
+    return cw.load_policy(folder)
 
 
 @pytest.fixture(scope="module")

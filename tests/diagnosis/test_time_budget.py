@@ -30,7 +30,7 @@ BALL = "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody
 
 @pytest.fixture(scope="module")
 def recording():
-    return swung(seconds=1.0)
+    return swung(seconds=0.5)
 
 
 class Clock:

@@ -18,17 +18,17 @@ def test_the_page_shows_the_newest_frame_and_the_states_so_far(tmp_path):
     recording = drawn(truth, np.arange(4) / 20)
     recording[0].image["camera"].depth[2:] = 0.2
     view, shown = LiveTrackView(cw.LiveTrackCfg(port=8795, period=0)), []
-    with opened(view.address, tmp_path) as page:
-        page.wait_for("Waiting for the first frame")
+    try:
+        with opened(view.address, tmp_path) as page:
+            page.wait_for("Waiting for the first frame")
 
-        def watch(moment):
-            view.show(moment)
-            shown.append(page.wait_for(rf"frame {moment.number + 1} of 4[^\0]*frames so far")[0])
+            def watch(moment):
+                view.show(moment)
+                shown.append(page.wait_for(rf"frame {moment.number + 1} of 4[^\0]*frames so far")[0])
 
-        try:
             cw.track(recording, pose={"block": truth[0]}, watch=watch)
-        finally:
-            view.stop()
+    finally:
+        view.stop()  # with a page open it waits for seconds
     assert page.messages == []
     assert "block: tracked; tracked in 1 of 1 frames so far" in shown[0]
     assert "block: lost: " in shown[3]

@@ -159,7 +159,7 @@ setInterval(() => { document.title = tell(); }, 100);
 def test_controls_turn_zoom_choose_and_play(case, tmp_path):
     page = tmp_path / "used.html"
     page.write_text(case.path.read_text().replace("</body>", USE + "</body>"))
-    dom, messages = browse(page, tmp_path, "--window-size=1200,2600", "--dump-dom", "--virtual-time-budget=500")
+    dom, messages = browse(page, tmp_path, "--window-size=640,900", "--dump-dom", "--virtual-time-budget=300")
     assert messages == []
     found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
     assert found.pop("clock").startswith("0.30 s")

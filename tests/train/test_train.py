@@ -27,7 +27,6 @@ from concent_warp.train.run import TrainingRun, train_run
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.evaluate import run_episodes, wilson
 
-LEARNING = PpoCfg(iterations=28, hidden=(64, 64), learning_rate=2e-3)
 SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 
 
@@ -44,9 +43,13 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return torch.load(folder / CHECKPOINT, weights_only=True)["actor_state_dict"]
 
 
-def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
-    settings = replace(SETTINGS, observation=replace(EXACT_STATE, leads=False))
-    cfg = TrainCfg(environment=settings, ppo=LEARNING, stress=StressCfg(every=0))
+@pytest.mark.parametrize(("position", "iterations"), [(0.004, 18), pytest.param(0.008, 28, marks=pytest.mark.slow)])
+def test_insertion_is_learnt_from_contact_events_on_a_cpu(made, position, iterations):
+    """Initial states half as far from the demonstration are learnt in fewer iterations."""
+    reset = replace(SETTINGS.reset, position=position)
+    settings = replace(SETTINGS, observation=replace(EXACT_STATE, leads=False), reset=reset)
+    learning = PpoCfg(iterations=iterations, hidden=(64, 64), learning_rate=2e-3)
+    cfg = TrainCfg(environment=settings, ppo=learning, stress=StressCfg(every=0))
     trainer, last = train_run(replace(made, cfg=cfg), None, device="cpu")
     assert last is not None
     assert last.seconds < 120
