@@ -16,6 +16,7 @@ import pytest
 import tyro
 
 from concent_warp.cli.entry import COMMANDS
+from concent_warp.reality.expert.plan import ExpertCfg
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 
@@ -62,9 +63,9 @@ def commands() -> list[str]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of Reality."""
+    """Return a recording of Reality, of a fast demonstration: how long it is does not matter to the pages."""
     path = tmp_path_factory.mktemp("docs") / "demo.h5"
-    write_hdf5(record(RealityCfg(), [0])[0], path)
+    write_hdf5(record(RealityCfg(expert=ExpertCfg(speed=2.0)), [0])[0], path)
     return path
 
 

@@ -221,10 +221,14 @@ def test_a_ball_rebounds_alike_from_every_height_on_the_plane(script):
         ("tumble-inertia-large", 2.0),
     ],
 )
-def test_truth_explains_the_data_but_not_exactly(script, worlds, name, most):
+def test_truth_explains_the_data_but_not_exactly(script, worlds, monkeypatch, name, most):
     """The library's effect at its true value leaves a residual that is not the noise: nothing is adjusted to agree."""
-    data_sets = script("benchmarks.independent.data_sets")
-    nominal, truth = data_sets.residual_ratios(worlds.make(replace(named(worlds, name), demonstrations=1)))
+    data_sets, case = script("benchmarks.independent.data_sets"), replace(named(worlds, name), demonstrations=1)
+    experiments = script("benchmarks.independent.mujoco_rigs").EXPERIMENTS
+    rig = experiments[case.rig].rig
+    few = replace(experiments[case.rig], rig=replace(rig, throws=min(rig.throws, 3)))
+    monkeypatch.setitem(experiments, case.rig, few)
+    nominal, truth = data_sets.residual_ratios(worlds.make(case))
     assert max(truth.values()) > 1.01
     assert max(truth.values()) < min(most, 0.85 * max(nominal.values()))
 

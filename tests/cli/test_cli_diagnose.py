@@ -7,10 +7,12 @@ import pytest
 
 from concent_warp.cli import main
 from concent_warp.cli.fitted_effects import time_left
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose as diagnosed
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Channel
 from tests.scenes.swinging import DAMPING, NOISE, swing_scene, swung
 
@@ -25,6 +27,14 @@ def swing(tmp_path_factory):
     write_hdf5(swung(seconds=1.0, damping=0.0), folder / "null.h5")
     (folder / "scene.xml").write_text(swing_scene())
     return folder
+
+
+@pytest.fixture(scope="module")
+def answer(swing) -> Diagnosis:
+    """What the diagnosis of the recording of a pendulum comes to."""
+    cfg = DiagnoseCfg(effects=("joint_damping", "armature"), jobs=1)
+    recording = load_recording(swing / "demo.h5")
+    return diagnosed(Model.from_recording(recording), recording, cfg)
 
 
 def diagnose(path, *arguments):
@@ -91,13 +101,14 @@ def test_where_nothing_is_missing_nothing_is_saved(swing, tmp_path, capsys):
     assert not out.exists()
 
 
-def test_the_table_names_the_owners_of_parameters_and_shows_those_that_exclude_no_change(swing, capsys, monkeypatch):
-    def three(*given, **more) -> Diagnosis:
-        found = diagnosed(*given, **more)
-        first = found.effects[0]
+def test_the_table_names_the_owners_of_parameters_and_shows_those_that_exclude_no_change(
+    swing, answer, capsys, monkeypatch
+):
+    def three(*_, **__) -> Diagnosis:
+        first = answer.effects[0]
         (p,) = first.parameters
         null = [replace(p, name=f"damping[{name}]", value=0.0, low=0.0) for name in ("shoulder", "elbow")]
-        return replace(found, effects=(replace(first, parameters=(*null, replace(p, name="damping[wrist]"))),))
+        return replace(answer, effects=(replace(first, parameters=(*null, replace(p, name="damping[wrist]"))),))
 
     monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", three)
     assert diagnose(swing / "demo.h5") == 0
@@ -108,11 +119,11 @@ def test_the_table_names_the_owners_of_parameters_and_shows_those_that_exclude_n
     assert "1 more" in table
 
 
-def test_effects_that_explain_too_little_are_named_and_not_saved(swing, tmp_path, capsys, monkeypatch):
+def test_effects_that_explain_too_little_are_named_and_not_saved(swing, answer, tmp_path, capsys, monkeypatch):
     out = tmp_path / "m.toml"
 
-    def little(*given, **more) -> Diagnosis:
-        return replace(diagnosed(*given, **more), verdict="none_of_these", unexplained=0.9, explains=False)
+    def little(*_, **__) -> Diagnosis:
+        return replace(answer, verdict="none_of_these", unexplained=0.9, explains=False)
 
     monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", little)
     assert diagnose(swing / "demo.h5", "--apply", str(out)) == 0
@@ -126,15 +137,16 @@ def test_effects_that_explain_too_little_are_named_and_not_saved(swing, tmp_path
     assert not out.exists()
 
 
-def test_where_nothing_explains_the_data_it_says_that_no_effect_was_accepted(swing, tmp_path, capsys, monkeypatch):
+def test_where_nothing_explains_the_data_it_says_that_no_effect_was_accepted(
+    swing, answer, tmp_path, capsys, monkeypatch
+):
     out = tmp_path / "m.toml"
 
-    def none(*given, **more) -> Diagnosis:
-        found = diagnosed(*given, **more)
-        effects = tuple(replace(f, accepted=False, reason="no better than chance") for f in found.effects)
+    def none(*_, **__) -> Diagnosis:
+        effects = tuple(replace(f, accepted=False, reason="no better than chance") for f in answer.effects)
         # As a search without an accepted effect ends where much more than noise is left.
-        missing = replace(found, verdict="none_of_these", unexplained=1.0, effects=effects, groups=())
-        return replace(missing, models=found.models[:1], ratio=found.ratio[:1], explains=False)
+        missing = replace(answer, verdict="none_of_these", unexplained=1.0, effects=effects, groups=())
+        return replace(missing, models=answer.models[:1], ratio=answer.ratio[:1], explains=False)
 
     monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", none)
     assert diagnose(swing / "demo.h5", "--apply", str(out)) == 0

@@ -54,14 +54,21 @@ def recorded(scene: str, actuator: str, command: np.ndarray, torque: Any, inerti
 
 def door(stiffness: float, preload: float, damping: float = 0.6) -> Recording:
     """Return a door that is pushed and pulled by hand."""
-    time = np.arange(0, 8, PERIOD)
+    time = np.arange(0, 6, PERIOD)
     pushes = 9 * np.sin(np.pi * time) ** 2 * np.sign(np.sin(0.5 * np.pi * time)) - preload
     return recorded(DOOR, "hand", pushes, lambda q, v, u: u - damping * v - stiffness * q + preload, DOOR_INERTIA, 1)
 
 
-def arm(stiffness: float = 0.0, share: float = 0.0, kp: float = 1.0, kv: float = 1.0, reach: float = 0.8) -> Recording:
+def arm(
+    stiffness: float = 0.0,
+    share: float = 0.0,
+    kp: float = 1.0,
+    kv: float = 1.0,
+    reach: float = 0.8,
+    seconds: float = 3.0,
+) -> Recording:
     """Return an arm that swings; a share of its weight is held up, and the servo's gains are off by factors."""
-    time = np.arange(0, 4, PERIOD)
+    time = np.arange(0, seconds, PERIOD)
     command = reach * (0.6 * np.sin(2.2 * time) + 0.4 * np.sin(5 * time))
 
     def torque(q: float, v: float, u: float) -> float:
@@ -110,6 +117,6 @@ def test_wide_swings_tell_a_spring_from_weight_and_gain(changes, name):
 
 
 def test_a_spring_in_small_swings_is_named_together_with_weight_that_pulls_the_same_way():
-    found = diagnosed(arm(stiffness=0.6, reach=0.1))
+    found = diagnosed(arm(stiffness=0.6, reach=0.1, seconds=4.0))
     assert found.verdict == "group"
     assert [set(group) for group in found.groups] == [{"joint_stiffness", "gravity_compensation"}]

@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_hdf5(small_arm.recording(range(3), 40), place / "empty.h5")
     write_hdf5(small_arm.recording([9], 16, objects=True), place / "held.h5")
     ball().write(place / "ball.ply")
-    assert main(["render-train", str(place / "empty.h5"), "--out", str(place / "net"), "--steps", "160", *TRAIN]) == 0
+    assert main(["render-train", str(place / "empty.h5"), "--out", str(place / "net"), "--steps", "80", *TRAIN]) == 0
     return place
 
 
@@ -77,7 +77,7 @@ def test_hybrid_images_are_nearer_to_the_cameras_than_the_simulations(folder):
 
 def test_training_is_gone_on_with_and_other_settings_are_refused(folder, capsys):
     command = ["render-train", str(folder / "empty.h5"), "--out", str(folder / "net"), *TRAIN]
-    assert main([*command, "--steps", "160", "--resume"]) == 0
+    assert main([*command, "--steps", "80", "--resume"]) == 0
     assert main([*command, "--steps", "260"]) == 2
     assert "holds a run" in capsys.readouterr().err
     assert main([*command, "--steps", "260", "--resume"]) == 2
