@@ -3,12 +3,13 @@
 import signal
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from benchmarks.robustness import at_once, disk_full, killed
-from benchmarks.robustness.commands import SERVO_MODEL, WRITING, Ended, ended, launch, prepare
+from benchmarks.robustness.commands import SERVO_MODEL, WRITING, Ended, Writing, ended, launch, prepare
 from benchmarks.robustness.contents import hashes, unfinished, unreadable
 from benchmarks.robustness.page import page
 
@@ -42,8 +43,11 @@ def test_of_two_at_once_one_succeeds(inputs):
     assert found["overwrite"]["faults"] == []
 
 
-def test_a_diagnosis_killed_at_a_late_moment_gives_the_same_result(inputs, tmp_path):
-    diagnose = killed.KILLABLE["diagnose"]
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_diagnosis_killed_at_a_late_moment_gives_the_same_result(inputs, tmp_path, jobs):
+    writing = Writing("diagnose", killed.DIAGNOSE.replace("--jobs 2", f"--jobs {jobs}"))
+    diagnose = replace(killed.KILLABLE["diagnose"], writing=writing)
+    assert f"--jobs {jobs}" in diagnose.writing.line
     (tmp_path / "out").mkdir()
     whole = diagnose.finish(inputs, tmp_path, resumed=False)
     assert whole.code == 0
