@@ -145,7 +145,15 @@ def reference(case: Case) -> str:
     return "ours" if case.world == "plain" else "unaware"
 
 
-def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL, states: ResetStates | None = None) -> Row:
+def trial(
+    args: Args,
+    name: str,
+    seed: int,
+    world: RealityWorldCfg = IDEAL,
+    states: ResetStates | None = None,
+    *,
+    own: bool = False,
+) -> Row:
     """Run a policy in Reality, by default in one that it knows and observes exactly.
 
     Args:
@@ -154,13 +162,14 @@ def trial(args: Args, name: str, seed: int, world: RealityWorldCfg = IDEAL, stat
         seed: Seed of the policy.
         world: Reality.
         states: Initial states; by default those of the case that is the reference.
+        own: Whether the reference is the case itself.
     """
     quiet_warp()
     torch.set_num_threads(1)
     case, folder = CASES[name], policy_folder(args, name, seed)
     policy = Policy.load(folder).scaled(setpoint_lead_scale=args.setpoint_lead_scale)
     run = policy.run
-    judge = TrainingRun.load(policy_folder(args, reference(case), seed))
+    judge = run if own else TrainingRun.load(policy_folder(args, reference(case), seed))
     task, shown = run.task(), judge.task()
     states = judge.evaluation_states(shown, args.episodes, seed) if states is None else states
     # A model in which the demonstration does not get as far has fewer stages.

@@ -11,8 +11,8 @@ def trials(script):
 def row(seed, successes, **given):
     facts = dict.fromkeys(("processor", "cores", "python", "mujoco", "mujoco-warp", "warp-lang", "torch", "date"), "x")
     return {
-        "seed": seed, "episodes": 100, "successes": successes, "settings": "", "spheres": 512, "machine": facts,
-        "trained_on": facts, "trained": {"steps": 9_830_400}, "simulation": {"rate": 1.0},
+        "case": "ours", "seed": seed, "episodes": 100, "successes": successes, "settings": "", "spheres": 512,
+        "machine": facts, "trained_on": facts, "trained": {"steps": 9_830_400}, "simulation": {"rate": 1.0},
         "stress": {"successes": successes // 2, "episodes": 50}, **given,
     }  # fmt: skip
 
@@ -26,6 +26,17 @@ def test_tasks_and_stages_have_tables_of_their_own(trials):
     assert "1: 20.0%" in text[chain:peg]
     assert "3: 40.0%" in text[peg:]
     assert "Stacking" not in text
+
+
+def test_another_case_has_a_row_of_its_own_and_is_compared_on_the_seeds_that_both_have(trials):
+    ours = [row(1, 90), row(2, 80), row(3, 40)]
+    others = [row(seed, successes, case="inset") for seed, successes in ((1, 85), (2, 77), (4, 10))]
+    text = trials.page([*ours, *others])
+    assert "| default | 512 | 9.8 M | 70.0% |" in text
+    assert "| default, without optimisation, spheres inset | 512 | 9.8 M | 57.3% |" in text
+    assert "spheres inset: 81.0%, ours 85.0% with the same settings on the seeds that both have (1, 2)" in text
+    assert "The difference is 4.0 points [-8.7, 16.7]" in text
+    assert "both have" not in trials.page([*ours, row(1, 85, case="inset", settings="--seed 3")])
 
 
 def test_prediction_is_of_insertion_alone(trials):
