@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.checks import check_settings
+from concent_warp.deploy.explain.arm_alone import arm_alone, in_whole_scene, readings_alone
 from concent_warp.deploy.explain.cfg import ExplainCfg
 from concent_warp.deploy.explain.contact_windows import WindowSimulation
 from concent_warp.deploy.explain.evidence import Evidence, Judge
@@ -220,16 +221,19 @@ class _Explaining:
 
     def _with_diagnosis(self, evidence: Evidence, judge: Judge, others: Sequence[PreparedTrial]) -> Evidence:
         """Search for a missing effect in failed trials, and see how much of all trials' misfit it explains."""
-        cfg, names = self._cfg, self._cfg.effects
+        cfg, names, model = self._cfg, self._cfg.effects, self._policy.run.model
+        tried = model
         if judge.moves_otherwise(evidence):
             names = names or _robot_effects()
             self._progress(0.45, "finding the longest free motion")
-            recording = self._free_motion([*evidence.trials, *others, *self._preparation.usable(self._further)])
-            evidence = replace(evidence, free_motion=self._write(recording))
+            free = self._free_motion([*evidence.trials, *others, *self._preparation.usable(self._further)])
+            evidence = replace(evidence, free_motion=self._write(free))
+            tried = arm_alone(model, self._own.task, evidence.trials[0].measured.grasped)
+            recording = readings_alone(free, tried)
         else:
             recording = _joined([d for _, d in self._chosen[: cfg.diagnose_trials]], self._recordings[0])
         settings = DiagnoseCfg(
-            effects=self._possible(names, recording), max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
+            effects=_possible(tried, names, recording), max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
             seed=cfg.seed, explain=False,
         )  # fmt: skip
         out = None if self._out is None else Path(self._out) / "diagnosis"
@@ -237,8 +241,7 @@ class _Explaining:
         def between(begin: float, end: float) -> Progress:
             return lambda share, text: self._progress(begin + (end - begin) * share, f"diagnosing: {text}")
 
-        model = self._policy.run.model
-        diagnosis = diagnose(model, recording, settings, out=out, progress=between(0.45, 0.8))
+        diagnosis = diagnose(tried, recording, settings, out=out, progress=between(0.45, 0.8))
 
         def explained(finding: Finding) -> np.ndarray:
             values = {p.name: p.value for p in finding.parameters}
@@ -250,9 +253,11 @@ class _Explaining:
             name = better[0].name.partition("(")[0]
             again = None if self._out is None else Path(self._out) / f"diagnosis_{name}"
             alone = replace(settings, effects=(name,))
-            other = diagnose(model, recording, alone, out=again, progress=between(0.8, 0.9))
+            other = diagnose(tried, recording, alone, out=again, progress=between(0.8, 0.9))
             if other.accepted:
                 diagnosis, evidence = other, replace(evidence, preference=better[1])
+        if tried is not model:
+            diagnosis = in_whole_scene(diagnosis, model)
         after = self._misfit(evidence, diagnosis.model) if diagnosis.accepted else None
         return replace(evidence, diagnosis=diagnosis, misfit_with_effect=after)
 
@@ -279,21 +284,6 @@ class _Explaining:
         make_folder(path.parent)
         write_hdf5(free_motion, path)
         return str(path)
-
-    def _possible(self, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
-        """Return those of some effects that could be missing in the model.
-
-        Raises:
-            ModelError: None could be.
-        """
-        from concent_warp.diagnosis.candidates.candidates import candidates
-
-        channels = {c for d in recording.demonstrations for c in d.measured}
-        model = self._policy.run.model
-        found = tuple(name for name in names if candidates(model, channels, [name]))
-        if names and not found:
-            raise ModelError("none of the effects can be missing", where=model.scene.source, found=", ".join(names))
-        return found
 
     def _with_cause_in_simulation(self, evidence: Evidence, judge: Judge) -> Evidence:
         """Put the cause into the policy's own simulation: does it fail there as well?"""
@@ -328,6 +318,21 @@ def _known(values: Sequence[float | None]) -> np.ndarray:
 def _robot_effects() -> tuple[str, ...]:
     """Return the names of the effects that act on a robot that touches nothing."""
     return tuple(n for n, kind in effect_classes().items() if kind.family == "joints" or n == "gravity_tilt")
+
+
+def _possible(model: Model, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
+    """Return those of some effects that could be missing in a model.
+
+    Raises:
+        ModelError: None could be.
+    """
+    from concent_warp.diagnosis.candidates.candidates import candidates
+
+    channels = {c for d in recording.demonstrations for c in d.measured}
+    found = tuple(name for name in names if candidates(model, channels, [name]))
+    if names and not found:
+        raise ModelError("none of the effects can be missing", where=model.scene.source, found=", ".join(names))
+    return found
 
 
 def _joined(trials: Sequence[Demonstration], first: Recording) -> Recording:
