@@ -89,11 +89,16 @@ def test_effects_come_back_into_the_whole_scene(policy: cw.Policy, task: Task) -
     whole = whole.add_effect("mass", ("block",), {"mass": 1.5}).add_effect("mass", ("link6",), {"mass": 1.2})
     whole = whole.add_effect("gravity_tilt", values={"x": 0.01})
     alone = arm_alone(whole, task, GRASPED)
-    assert [(a.effect.name, a.effect.target) for a in alone.effects] == [("mass", ("link6",)), ("gravity_tilt", ())]
-    nominal, heavier = (one.compile().body("link6").mass[0] for one in (policy.run.model, alone))
-    assert heavier == pytest.approx(1.2 * nominal)
-    refitted = replace(alone.effects[1], values=(0.02, 0.0))
-    damped = replace(alone, effects=(alone.effects[0], refitted)).add_effect("actuator_delay", values={"delay": 0.02})
+    assert [a.effect.name for a in alone.effects] == ["mass", "mass", "gravity_tilt"]
+    nominal, heavier = policy.run.model.compile(), alone.compile()
+    for name, factor in (("block", 1.5), ("link6", 1.2)):
+        assert heavier.body(name).mass[0] == pytest.approx(factor * nominal.body(name).mass[0])
+    for kind in cw.effect_classes().values():
+        if kind.kind == "body":  # what acts on a part of the arm alone acts on one of the whole
+            targets = {name for group in kind.targets(heavier) for name in kind(*group).elements}
+            assert all(policy.run.model.scene.spec().body(name) for name in targets)
+    refitted = replace(alone.effects[2], values=(0.02, 0.0))
+    damped = replace(alone, effects=(*alone.effects[:2], refitted)).add_effect("actuator_delay", values={"delay": 0.02})
     recording = Recording(alone.scene.xml, readings_alone(policy.run.recording, alone).demonstrations)
     cfg = cw.DiagnoseCfg(effects=("gravity_tilt",), jobs=1, explain=False, seconds=1.0)
     diagnosis = replace(cw.diagnose(alone, recording, cfg), models=(alone, damped))

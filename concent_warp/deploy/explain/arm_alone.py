@@ -41,11 +41,11 @@ def arm_alone(model: Model, task: Task, grasped: tuple[np.ndarray, Rotation] | N
         _set_inertia(body, nominal, nominal.body(body.name).id)
     for joint in [j for j in spec.joints if j.name not in joints]:
         spec.delete(joint)
-    if grasped is not None:
-        _carry(spec, m, task.robot.tool, task.objects[0], grasped)
     for name in model.scene.objects():
         if (body := spec.body(name)) is not None:  # else it was part of one before it
             spec.delete(body)
+    if grasped is not None:
+        _carry(spec, nominal, m.site(task.robot.tool).name, m.body(task.objects[0]).name, grasped)
     rest = (*spec.geoms, *spec.tendons, *spec.equalities, *spec.pairs, *spec.excludes, *spec.keys, *spec.cameras)
     for one in (*rest, *spec.lights, *spec.skins, *spec.meshes, *spec.hfields, *spec.texts, *spec.tuples):
         spec.delete(one)
@@ -94,15 +94,15 @@ def _set_inertia(body: mujoco.MjsBody, m: mujoco.MjModel, i: int) -> None:
     body.iquat, body.explicitinertial = m.body_iquat[i], bool(m.body_mass[i])
 
 
-def _carry(spec: mujoco.MjSpec, m: mujoco.MjModel, tool: int, load: int, grasped: tuple[np.ndarray, Rotation]) -> None:
-    """Fix a copy of a body to the one that carries the tool."""
-    place, turn = grasped
-    site = Rotation.from_quat(m.site_quat[tool], scalar_first=True)
-    body = spec.body(m.body(int(m.site_bodyid[tool])).name).add_body()
-    body.pos = m.site_pos[tool] + site.apply(place)
-    body.quat = (site * turn).as_quat(scalar_first=True)
-    body.gravcomp = float(m.body_gravcomp[load])
-    _set_inertia(body, m, load)
+def _carry(spec: mujoco.MjSpec, m: mujoco.MjModel, tool: str, load: str, grasped: tuple[np.ndarray, Rotation]) -> None:
+    """Fix a body of a compiled model to the one that carries the tool; it keeps its name, for effects on it."""
+    (place, turn), site = grasped, m.site(tool)
+    frame = Rotation.from_quat(site.quat, scalar_first=True)
+    body = spec.body(m.body(int(site.bodyid[0])).name).add_body(name=load)
+    body.pos = site.pos + frame.apply(place)
+    body.quat = (frame * turn).as_quat(scalar_first=True)
+    body.gravcomp = float(m.body_gravcomp[m.body(load).id])
+    _set_inertia(body, m, m.body(load).id)
 
 
 def _has(m: mujoco.MjModel, kind: str, name: str) -> bool:
