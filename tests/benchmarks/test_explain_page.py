@@ -24,7 +24,10 @@ def test_an_effect_counts_as_named_whatever_joints_it_acts_on():
                  groups=[["actuator_lag", "backlash"]]),
         "c": row("physics", "unexplained", effect="armature"),
     }  # fmt: skip
-    text = page(rows)
+    before = {"b": row("physics", "physics", effect="backlash", effects=["backlash"], verdict="effect", seconds=7)}
+    text = page(rows, None, before)
+    assert "| b | actuator_lag | None | 0 | backlash | effect | 7 |" in text
+    assert "named 1 first" in text
     assert "Of 3 cases of changed physics the missing effect is named first in 1 " in text
     assert "among those that the data cannot distinguish in 2." in text
     assert "| physics | 2 of 3 |" in text

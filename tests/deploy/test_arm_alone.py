@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import concent_warp as cw
-from concent_warp.deploy.explain.arm_alone import arm_alone, in_whole_scene, readings_alone
+from concent_warp.deploy.explain.arm_alone import arm_alone, in_whole_scene, readings_alone, with_arm_alone
 from concent_warp.recording.recording import Recording
 from concent_warp.train.task.task import Task
 
@@ -82,6 +82,28 @@ def test_readings_and_commands_of_the_arm_are_kept(policy: cw.Policy, alone: cw.
     assert set(d.measured) == {f"joint{k}_position" for k in range(1, 8)}
     assert d.qpos is None
     alone.check_recording(found)
+
+
+def test_whatever_else_is_in_the_scene_is_left_out(policy: cw.Policy, task: Task) -> None:
+    model, free = policy.run.model, policy.run.recording
+    found, recording = with_arm_alone(model, task, GRASPED, free)
+    assert found.compile().nv == 7
+    assert recording.scene == found.scene.xml
+    touched = '<contact><exclude body1="hand" body2="link1"/></contact><sensor><touch site="tcp" name="felt"/></sensor>'
+    bound = replace(model, scene=cw.Scene(model.scene.xml.replace("</mujoco>", f"{touched}</mujoco>")))
+    assert with_arm_alone(bound, task, GRASPED, free)[0].compile().nsensor == found.compile().nsensor
+    hung = '<body name="hanging"><joint name="swing"/><geom size=".1"/></body></worldbody>'
+    loose = replace(model, scene=cw.Scene(model.scene.xml.replace("</worldbody>", hung)))
+    assert with_arm_alone(loose, task, GRASPED, free)[0].compile().nv == 7
+
+
+def test_a_scene_that_lacks_a_part_stays_whole(policy: cw.Policy, task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise ValueError("a plugin has lost its joint")
+
+    monkeypatch.setattr("concent_warp.deploy.explain.arm_alone._carry", refuse)
+    model, free = policy.run.model, policy.run.recording
+    assert with_arm_alone(model, task, GRASPED, free) == (model, free)
 
 
 def test_effects_come_back_into_the_whole_scene(policy: cw.Policy, task: Task) -> None:

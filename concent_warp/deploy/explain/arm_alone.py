@@ -15,11 +15,29 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.effects.effect import OBJECTS, AddedEffect
-from concent_warp.errors import ModelError
+from concent_warp.errors import ConcentError, ModelError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.train.task.task import Task
+
+
+def with_arm_alone(
+    model: Model, task: Task, grasped: tuple[np.ndarray, Rotation] | None, free: Recording
+) -> tuple[Model, Recording]:
+    """Return model and recording of the arm alone, see `arm_alone`; as given where it cannot be taken out of the scene.
+
+    Args:
+        model: The model.
+        task: The task in it.
+        grasped: See `arm_alone`.
+        free: Recording of free motion in the whole scene.
+    """
+    try:
+        alone = arm_alone(model, task, grasped)
+    except (ConcentError, ValueError):  # its parts need others, as those that a plugin drives
+        return model, free
+    return alone, readings_alone(free, alone)
 
 
 def arm_alone(model: Model, task: Task, grasped: tuple[np.ndarray, Rotation] | None) -> Model:

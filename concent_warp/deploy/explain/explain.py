@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.checks import check_settings
-from concent_warp.deploy.explain.arm_alone import arm_alone, in_whole_scene, readings_alone
+from concent_warp.deploy.explain.arm_alone import in_whole_scene, with_arm_alone
 from concent_warp.deploy.explain.cfg import ExplainCfg
 from concent_warp.deploy.explain.contact_windows import WindowSimulation
 from concent_warp.deploy.explain.evidence import Evidence, Judge
@@ -228,8 +228,7 @@ class _Explaining:
             self._progress(0.45, "finding the longest free motion")
             free = self._free_motion([*evidence.trials, *others, *self._preparation.usable(self._further)])
             evidence = replace(evidence, free_motion=self._write(free))
-            tried = arm_alone(model, self._own.task, evidence.trials[0].measured.grasped)
-            recording = readings_alone(free, tried)
+            tried, recording = with_arm_alone(model, self._own.task, evidence.trials[0].measured.grasped, free)
         else:
             recording = _joined([d for _, d in self._chosen[: cfg.diagnose_trials]], self._recordings[0])
         settings = DiagnoseCfg(
