@@ -169,6 +169,35 @@ def test_free_motion_ends_before_the_object_comes_near_anything(
     assert 0.4 < max(ends) <= 0.6 < moving.readings.end
 
 
+@pytest.mark.parametrize(("effects", "moving"), [((), 7), (("joint_damping",), 7), (("pad_friction",), 15)])
+def test_effects_are_searched_for_in_the_arm_alone_unless_one_wants_the_object(
+    policy: cw.Policy,
+    prepared: tuple[Preparation, list[PreparedTrial]],
+    monkeypatch: pytest.MonkeyPatch,
+    effects: tuple[str, ...],
+    moving: int,
+) -> None:
+    found: list[tuple[int, set[str]]] = []
+
+    class AskedError(Exception):
+        """Ends the explanation where the diagnosis begins."""
+
+    def asked(model: cw.Model, recording: Recording, *_: Any, **__: Any) -> None:
+        model.check_recording(recording)
+        found.append((model.compile().nv, set(recording[0].measured)))
+        raise AskedError
+
+    monkeypatch.setattr("concent_warp.deploy.explain.explain.diagnose", asked)
+    trial = replace(prepared[1][1], free_error=9.0, free_time=0.6)
+    given = Recording(policy.run.recording.scene, (trial.demonstration,))
+    explaining = _Explaining(policy, [given], cw.ExplainCfg(effects=effects), ignore_progress, None)
+    judge: Any = SimpleNamespace(moves_otherwise=lambda _: True)
+    with pytest.raises(AskedError):
+        explaining._with_diagnosis(evidence(trials=[trial]), judge, [])
+    assert found[0][0] == moving
+    assert ("block_position" in found[0][1]) == (moving == 15)
+
+
 def test_trials_that_all_succeeded_are_refused(
     policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
 ) -> None:

@@ -229,10 +229,15 @@ class _Explaining:
             free = self._free_motion([*evidence.trials, *others, *self._preparation.usable(self._further)])
             evidence = replace(evidence, free_motion=self._write(free))
             tried, recording = with_arm_alone(model, self._own.task, evidence.trials[0].measured.grasped, free)
+            if any(not _possible(tried, [name], recording) for name in cfg.effects):
+                tried, recording = model, free  # what was asked for wants the object
         else:
             recording = _joined([d for _, d in self._chosen[: cfg.diagnose_trials]], self._recordings[0])
+        possible = _possible(tried, names, recording)
+        if names and not possible:
+            raise ModelError("none of the effects can be missing", where=model.scene.source, found=", ".join(names))
         settings = DiagnoseCfg(
-            effects=_possible(tried, names, recording), max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
+            effects=possible, max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
             seed=cfg.seed, explain=False,
         )  # fmt: skip
         out = None if self._out is None else Path(self._out) / "diagnosis"
@@ -320,18 +325,11 @@ def _robot_effects() -> tuple[str, ...]:
 
 
 def _possible(model: Model, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
-    """Return those of some effects that could be missing in a model.
-
-    Raises:
-        ModelError: None could be.
-    """
+    """Return those of some effects that could be missing in a model."""
     from concent_warp.diagnosis.candidates.candidates import candidates
 
     channels = {c for d in recording.demonstrations for c in d.measured}
-    found = tuple(name for name in names if candidates(model, channels, [name]))
-    if names and not found:
-        raise ModelError("none of the effects can be missing", where=model.scene.source, found=", ".join(names))
-    return found
+    return tuple(name for name in names if candidates(model, channels, [name]))
 
 
 def _joined(trials: Sequence[Demonstration], first: Recording) -> Recording:
