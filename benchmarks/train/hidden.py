@@ -191,10 +191,10 @@ def recovered(pairs: Sequence[tuple[Row, Row]], reference: float) -> str:
 
 
 def without_effect() -> float:
-    """Return the success of policies by default settings in trials of insertion with nothing hidden."""
+    """Return the success of our policies by default settings in trials of insertion with nothing hidden."""
     of = [
         row for row in read_data(TRIALS).values()
-        if FRESH[0] <= row["seed"] <= FRESH[1] and not row["settings"]
+        if row["case"] == "ours" and FRESH[0] <= row["seed"] <= FRESH[1] and not row["settings"]
         and (row.get("task", "shape_sorter"), row.get("stage", "insert")) == ("shape_sorter", "insert")
     ]  # fmt: skip
     return float(np.mean([rate(row) for row in of]))
