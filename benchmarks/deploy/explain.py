@@ -33,8 +33,8 @@ from concent_warp.train.trials.evaluate import wilson
 
 NAME = "explain"
 METHODS = ("windows", "windows, small errors preferred", "arm alone in free motion")
-"""How an error of tracked poses is searched for, last also in what effects are searched for; the first rows had none.
-They differ little in which cause they name."""
+"""How errors of tracked poses are searched for, and in the last one effects; the first rows had none. They differ
+little in which cause they name."""
 METHOD = METHODS[-1]
 """The present one. Rows of another one are measured again."""
 EFFECTS = FOLDER / "data" / f"{NAME}_effects.jsonl"

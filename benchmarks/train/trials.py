@@ -243,6 +243,8 @@ def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
 def main() -> None:
     """Try what is not tried yet, and write the page."""
     args = tyro.cli(Args, description=__doc__)
+    if args.case not in CASES:
+        raise SystemExit(f"trials: --case {args.case}: no such case; expected one of {', '.join(CASES)}")
     data = read_data(NAME)
     if missing := [str(folder) for folder in args.folders if not (folder / "runs").is_dir()]:
         raise SystemExit(f"trials: no trainings in {', '.join(missing)}; expected folders of benchmarks.train.learning")

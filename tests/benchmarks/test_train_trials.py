@@ -51,3 +51,10 @@ def test_a_folder_without_trainings_is_refused_and_no_page_is_written(trials, mo
     monkeypatch.setattr(trials, "write_page", lambda *_: pytest.fail("a page is written"))
     with pytest.raises(SystemExit, match="no trainings in"):
         trials.main()
+
+
+def test_a_case_that_does_not_exist_is_refused(trials, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["trials", "--case", "insett"])
+    monkeypatch.setattr(trials, "write_page", lambda *_: pytest.fail("a page is written"))
+    with pytest.raises(SystemExit, match="--case insett: no such case; expected one of ours, surface, inset"):
+        trials.main()
