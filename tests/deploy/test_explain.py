@@ -198,6 +198,22 @@ def test_effects_are_searched_for_in_the_arm_alone_unless_one_wants_the_object(
     assert ("block_position" in found[0][1]) == (moving == 15)
 
 
+def test_the_model_with_the_missing_effect_is_kept_until_there_is_none(
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]], tmp_path: Path
+) -> None:
+    given = Recording(policy.run.recording.scene, (prepared[1][1].demonstration,))
+    better = policy.run.model.add_effect("actuator_delay", values={"delay": 0.03})
+    found: Any = SimpleNamespace(accepted=("one",), changes_model=True, model=better)
+    explaining = _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, tmp_path / "out")
+    assert explaining._save(found) == str(tmp_path / "out" / "model.toml")
+    (effect,) = cw.load_model(tmp_path / "out" / "model.toml").effects
+    assert effect.values == (0.03,)
+    unchanged: Any = SimpleNamespace(accepted=("one",), changes_model=False)
+    assert explaining._save(unchanged) is None
+    assert not (tmp_path / "out" / "model.toml").exists()
+    assert _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, None)._save(found) is None
+
+
 def test_trials_that_all_succeeded_are_refused(
     policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
 ) -> None:

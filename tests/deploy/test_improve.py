@@ -204,6 +204,17 @@ def test_effects_are_fitted_to_the_free_motion_that_they_were_found_in(tmp_path:
     assert not (tmp_path / "out" / "failed.h5").exists()
 
 
+def test_the_model_of_an_explanation_is_taken_as_it_is(tmp_path: Path) -> None:
+    setting, one = swinging(tmp_path)
+    ready = tmp_path / "out" / "explanation" / "model.toml"
+    ready.parent.mkdir(parents=True)
+    cw.load_model(tmp_path / "model.toml").add_effect("joint_damping").save(ready)
+    damping = cw.MissingEffect("joint_damping", ("hinge",), ("damping[hinge]",), (0.5 * DAMPING,))
+    chosen = Mend("added", (damping,))
+    assert with_effects(setting, one, chosen, tmp_path / "out", lambda *_: None) == (one, None)
+    assert not (tmp_path / "out" / "model.toml").exists()
+
+
 def test_effects_of_the_model_are_fitted_again_by_a_command_too(tmp_path: Path) -> None:
     setting, one = swinging(tmp_path, "joint_damping")
     (tmp_path / "out").mkdir()

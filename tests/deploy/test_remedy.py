@@ -15,10 +15,11 @@ from concent_warp.deploy.explain.result import Cause
 FOUND = cast(Any, SimpleNamespace(accepted=[SimpleNamespace(name="joint_friction(joint1, ...)")] * 2))
 
 
+@pytest.mark.parametrize("better", [None, "out/my model.toml"])
 @pytest.mark.parametrize("free", [None, "out/free motion.h5"])
 @pytest.mark.parametrize("cause", ["perception", "physics", "policy", "unexplained"])
-def test_commands_are_understood(cause: Cause, free: str | None) -> None:
-    lines = remedy(cw.load_policy("shape_sorter"), cause, FOUND, ["my trials.h5"], free)
+def test_commands_are_understood(cause: Cause, free: str | None, better: str | None) -> None:
+    lines = remedy(cw.load_policy("shape_sorter"), cause, FOUND, ["my trials.h5"], free, better)
     commands = [shlex.split(line) for line in lines if not line.startswith("#")]
     assert len(commands) >= 2
     for concent, name, *arguments in commands:
@@ -28,3 +29,6 @@ def test_commands_are_understood(cause: Cause, free: str | None) -> None:
         if name == "diagnose":
             assert given.effects == ("joint_friction",)
             assert [str(path) for path in given.recording] == [free or "my trials.h5"]
+        if cause == "physics" and better is not None:
+            assert name in ("compare", "train")
+            assert str(given.model) == better

@@ -39,6 +39,7 @@ from concent_warp.run_folder import make_folder
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
+from concent_warp.train.run import MODEL
 
 JOINT_SCALE = 2.5
 """Joint errors over noise of simulated trials where there are none to take it from."""
@@ -61,7 +62,7 @@ def explain(
         recordings: Trials, as `evaluate` records them, or logs of a robot in the scene of the policy's model.
         cfg: Settings.
         out: Folder for what the search for a missing effect has finished, from which the same call continues after an
-            interruption, and for the result, ``explanation.json``.
+            interruption, and for the result, ``explanation.json``, and ``model.toml`` with the effects that it found.
         progress: Called with the share done, 0..1, and what is being done.
 
     Raises:
@@ -263,7 +264,7 @@ class _Explaining:
         if tried is not model:
             diagnosis = in_whole_scene(diagnosis, model)
         after = self._misfit(evidence, diagnosis.model) if diagnosis.accepted else None
-        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=after)
+        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=after, better=self._save(diagnosis))
 
     def _misfit(self, evidence: Evidence, model: Model) -> np.ndarray:
         """Return the misfits of the trials' replays in a model, shape (T,)."""
@@ -287,6 +288,21 @@ class _Explaining:
         path = Path(self._out) / FREE_MOTION
         make_folder(path.parent)
         write_hdf5(free_motion, path)
+        return str(path)
+
+    def _save(self, diagnosis: Diagnosis) -> str | None:
+        """Save the model with the missing effects where there is a folder for it, and return the file.
+
+        None where the diagnosis leaves the model as it is; one of an earlier call is removed.
+        """
+        if self._out is None:
+            return None
+        path = Path(self._out) / MODEL
+        if not (diagnosis.accepted and diagnosis.changes_model):
+            path.unlink(missing_ok=True)
+            return None
+        make_folder(path.parent)
+        diagnosis.model.save(path)
         return str(path)
 
     def _with_cause_in_simulation(self, evidence: Evidence, judge: Judge) -> Evidence:

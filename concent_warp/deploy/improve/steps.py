@@ -163,14 +163,15 @@ def explained(setting: Setting, one: ImprovementRound, folder: Path, report: Rep
 def with_effects(
     setting: Setting, one: ImprovementRound, chosen: Mend, folder: Path, report: Report
 ) -> tuple[ImprovementRound, FittedEffects | None]:
-    """Return a round with the model of the next policy written, and the fit of its effects; None without effects.
+    """Return a round with the model of the next policy written, and the fit of its effects; None where none is fitted.
 
-    They are fitted to the free motion that the missing effect was found in, or else to failed trials.
+    Missing effects have the values and intervals of the explanation. Where it wrote no model, and where those of
+    the model are fitted again, this is to the free motion that it used, or else to failed trials.
     """
+    if (not chosen.effects and not chosen.refit) or _explained_model(chosen, folder) is not None:
+        return one, None
     given = Path(one.policy) / MODEL
     model, commands = Model.load(given), []
-    if not chosen.effects and not chosen.refit:
-        return one, None
     trials, out = folder / EXPLANATION / FREE_MOTION, folder / MODEL
     if not trials.is_file():
         trials = folder / FAILED
@@ -194,6 +195,12 @@ def with_effects(
     return replace(one, fitted=found, commands=(*one.commands, *commands)), fitted
 
 
+def _explained_model(chosen: Mend, folder: Path) -> Path | None:
+    """Return the file of the model with missing effects that the explanation of a round wrote; None without one."""
+    path = folder / EXPLANATION / MODEL
+    return path if chosen.effects and path.is_file() else None
+
+
 def _write_failed_trials(setting: Setting, one: ImprovementRound, path: Path) -> None:
     """Write the first failed trials of a round as one recording."""
     every = merged([load_recording(name) for name in one.files])
@@ -214,9 +221,9 @@ def _add_command(effect: MissingEffect | None, given: Path, out: Path, trials: P
 
 def trained(setting: Setting, one: ImprovementRound, chosen: Mend, folder: Path, report: Report) -> ImprovementRound:
     """Return a round whose next policy is trained, from the present one."""
-    before, path = setting.policy(one.policy), folder / MODEL
-    if not path.is_file():
-        path = before.folder / MODEL
+    before = setting.policy(one.policy)
+    paths = _explained_model(chosen, folder), folder / MODEL, before.folder / MODEL
+    path = next(one for one in paths if one is not None and one.is_file())
     cfg = with_settings(training_cfg(setting.cfg, before.run.cfg, one.number), chosen.settings)
     total, demonstration = cfg.ppo.iterations, before.run.recording[0].name
 
