@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from benchmarks.foreign.jointed import Hidden, Machine, Motion
-from benchmarks.foreign.machines import double_pendulum, vertical_arm, yaw_arm
+from benchmarks.foreign.machines import (
+    corexy,
+    double_pendulum,
+    elastic_elbow,
+    leg,
+    reaction_wheel,
+    six_axis,
+    vertical_arm,
+    yaw_arm,
+)
 
 STEP = 2e-4
 """Time step of the laboratory's model in these tests [s]."""
@@ -32,16 +41,9 @@ def simulated(machine: Machine, motion: Motion, start: np.ndarray, stamps: dict[
     return found
 
 
-@pytest.mark.parametrize(
-    ("machine", "frictions"),
-    [
-        (double_pendulum.MACHINE, ()),
-        (yaw_arm.MACHINE, ("friction0", "friction1", "friction2")),
-    ],
-    ids=lambda x: getattr(x, "name", ""),
-)
-def test_without_friction_the_equations_agree_with_the_model_in_the_log_to_half_a_milliradian(machine, frictions):
-    values = machine.nominal._replace(**dict.fromkeys(frictions, 0.0))
+def both(machine: Machine) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return readings of the laboratory's model and of the equations of motion, by sensor, without friction."""
+    values = machine.nominal._replace(**{name: 0.0 for name in machine.nominal._fields if "friction" in name})
     motion = machine.motions(np.random.default_rng(3))[0]
     first = np.array([motion.commands[name].value[0] for name in machine.actuators])
     start = machine.rest(values, first) if motion.initial is None else motion.initial
@@ -50,10 +52,47 @@ def test_without_friction_the_equations_agree_with_the_model_in_the_log_to_half_
     found = simulated(machine, motion, start, stamps)
     expected = machine.readings(motion, values, Hidden(), stamps)
     m = mujoco.MjModel.from_xml_string(machine.model)
+    pairs = []
     for name, t in stamps.items():
         sensor = m.sensor(name)
         columns = slice(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
-        np.testing.assert_allclose(found[np.round(t / STEP).astype(int), columns], expected[name], atol=5e-4)
+        pairs.append((name, found[np.round(t / STEP).astype(int), columns], expected[name]))
+    return pairs
+
+
+@pytest.mark.parametrize(
+    "machine",
+    [double_pendulum.MACHINE, yaw_arm.MACHINE, corexy.MACHINE, six_axis.MACHINE],
+    ids=lambda machine: machine.name,
+)
+def test_without_friction_the_equations_agree_with_the_model_in_the_log_to_half_a_milliradian(machine):
+    for name, found, expected in both(machine):
+        np.testing.assert_allclose(found, expected, atol=5e-4, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "machine",
+    [leg.MACHINE, reaction_wheel.MACHINE, elastic_elbow.MACHINE],
+    ids=lambda machine: machine.name,
+)
+def test_without_friction_speeds_and_torques_agree_with_the_model_in_the_log_to_half_a_percent(machine):
+    for name, found, expected in both(machine):
+        np.testing.assert_allclose(found, expected, atol=5e-3 * np.ptp(expected), err_msg=name)
+
+
+def test_a_chain_of_links_has_the_acceleration_of_the_model_in_the_log():
+    m = mujoco.MjModel.from_xml_string(six_axis.MACHINE.model)
+    m.dof_frictionloss[:] = 0
+    d = mujoco.MjData(m)
+    rng = np.random.default_rng(0)
+    p = six_axis.Values(**{f"friction{k}": 0.0 for k in range(1, 7)})
+    for _ in range(5):
+        d.qpos[:], d.qvel[:] = rng.uniform(-1, 1, 6), rng.uniform(-2, 2, 6)
+        d.ctrl[:] = rng.uniform(-1, 1, 6)
+        mujoco.mj_forward(m, d)
+        rate = np.empty(12)
+        six_axis.derivative(0.0, np.concatenate([d.qpos, d.qvel]), d.ctrl.copy(), p, rate)
+        np.testing.assert_allclose(rate[6:], d.qacc, rtol=1e-9)
 
 
 def test_a_double_pendulum_without_damping_keeps_its_energy():
