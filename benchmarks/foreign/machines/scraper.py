@@ -97,19 +97,13 @@ def load(y: np.ndarray, p: Values) -> np.ndarray:  # noqa: ARG001
 
 
 def motions(rng: np.random.Generator) -> list[Motion]:
-    """Return slow strokes at three pressures, and short ones."""
-    t = clock(6.0, 125)
-    fast = rng.uniform(1.4, 1.7)
+    """Return slow strokes with a tremble, at four pressures."""
+    t = clock(8.0, 125)
+    across = sines(t, (0.014, 0.22, 0.0), (0.001, rng.uniform(1.3, 1.6), 0.0))
     level = rng.uniform(-0.014, -0.013)
-    strokes = {
-        "across": sines(t, (0.016, 0.22, 0.0)),
-        "down": reach(t, [(0, 0.005), (0.4, level), (2.4, -0.018), (4.2, -0.011), (5.4, 0.005)], 0.4),
-    }
-    short = {
-        "across": sines(t, (0.0016, fast, 0.0), (0.006, 0.25, 0.0)),
-        "down": reach(t, [(0, 0.008), (0.8, -0.016), (3.4, 0.008), (4.2, -0.013)], 0.6),
-    }
-    return [Motion(6.0, {name: Held(t, np.round(c, 6)) for name, c in m.items()}) for m in (strokes, short)]
+    pressed = [(0, 0.005), (0.4, level), (2.4, -0.018), (4.2, -0.011), (5.3, 0.006), (6.1, -0.016), (7.6, 0.0)]
+    commands = {"across": across, "down": reach(t, pressed, 0.4)}
+    return [Motion(8.0, {name: Held(t, np.round(c, 6)) for name, c in commands.items()})]
 
 
 MACHINE = Machine(
