@@ -33,11 +33,17 @@ class Cause:
     noise_stated: bool = False
 
 
+def changed(machine: Truth, values: Mapping[str, Any]) -> Truth:
+    """Return a machine, a dataclass or a named tuple, with some values replaced."""
+    if isinstance(machine, tuple):
+        return machine._replace(**values)  # type: ignore[attr-defined]
+    return replace(machine, **values)  # type: ignore[type-var]
+
+
 def varied(rng: Rng, nominal: Truth, names: Sequence[str]) -> Truth:
     """Return a machine of which each of these values is off by its own share."""
     shares = {name: rng.choice([-1, 1]) * rng.uniform(LEAST, MOST) for name in names}
-    changed: dict[str, Any] = {name: getattr(nominal, name) * (1 + share) for name, share in shares.items()}
-    return replace(nominal, **changed)  # type: ignore[type-var]
+    return changed(nominal, {name: getattr(nominal, name) * (1 + share) for name, share in shares.items()})
 
 
 def true_machine(machine: str, cause: Cause, nominal: Truth, names: Sequence[str]) -> tuple[Truth, Rng]:
@@ -45,7 +51,7 @@ def true_machine(machine: str, cause: Cause, nominal: Truth, names: Sequence[str
     rng = np.random.default_rng(crc32(f"{machine}-{cause.name}".encode()))
     truth = varied(rng, nominal, names)
     hidden: dict[str, Any] = {name: getattr(truth, name) * factor for name, factor in cause.factors.items()}
-    return replace(truth, **hidden, **cause.values), rng  # type: ignore[type-var]
+    return changed(truth, hidden | dict(cause.values)), rng
 
 
 def cases(
@@ -61,7 +67,7 @@ def cases(
     Args:
         machine: Name of the machine.
         model: The model of the laboratory, as MJCF.
-        nominal: Dataclass of the values that the model has.
+        nominal: Dataclass or named tuple of the values that the model has.
         names: Fields of it whose true values differ from the nominal ones.
         causes: What is hidden, one by one.
         record: Returns what is recorded of a true machine, and the noise of each sensor.

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 from benchmarks.foreign.contact import GRAVITY, Slab, integrate
-from benchmarks.foreign.machines import ball_beam, bowling_ball, door_push, gripper_lift, push_box, tossed_block
+from benchmarks.foreign.machines import (
+    air_puck,
+    ball_beam,
+    bowling_ball,
+    door_push,
+    gripper_lift,
+    off_centre_push,
+    push_box,
+    tossed_block,
+    vee_roller,
+)
 from benchmarks.foreign.readings import Command, command_times, conjugate, turned
 
 STEPS = 1000
@@ -129,9 +139,53 @@ def gripper_lift_case():
     return simulated, path.state[10::10, [0, 2]]
 
 
+def air_puck_case():
+    shot = air_puck.SHOTS[0]
+    _, state = air_puck.glide(air_puck.Values(), shot)
+
+    def throw(d):
+        d.qpos[:], d.qvel[:] = shot[:3], shot[3:6]
+
+    return replayed(air_puck.MODEL, [], shot[6], lambda d: d.qpos[:2].copy(), throw), state[1:, :2]
+
+
+def off_centre_push_case():
+    run = off_centre_push.PUSHES[0]
+    held, _, path = off_centre_push.push(off_centre_push.Values(), run)
+    command = Command(held.time, held.value)
+
+    def place(d):
+        d.qpos[1:3] = run[:2]
+        d.qpos[4:] = [np.cos(run[2] / 2), 0.0, 0.0, np.sin(run[2] / 2)]
+
+    duration = off_centre_push.DURATION
+    simulated = replayed(off_centre_push.MODEL, [command], duration, lambda d: d.qpos[:3].copy(), place)
+    return simulated, path[1:, :3]
+
+
+def vee_roller_case():
+    x = vee_roller.STARTS[1]
+    _, state = vee_roller.roll(vee_roller.Values(), x)
+    low = np.array([-0.3, vee_roller.height(-0.3)])
+
+    def place(d):
+        d.qpos[:2] = [x, vee_roller.height(x)] - low
+
+    simulated = replayed(vee_roller.MODEL, [], vee_roller.DURATION, lambda d: d.qpos[:2] + low, place)
+    return simulated, state[1:, :2]
+
+
 @pytest.mark.parametrize(
     ("case", "tolerance"),
-    [(push_box_case, 1e-3), (ball_beam_case, 1e-3), (door_push_case, 5e-3), (gripper_lift_case, 1e-3)],
+    [
+        (push_box_case, 1e-3),
+        (ball_beam_case, 1e-3),
+        (door_push_case, 5e-3),
+        (gripper_lift_case, 1e-3),
+        (air_puck_case, 5e-3),
+        (off_centre_push_case, 3e-3),
+        (vee_roller_case, 3e-3),
+    ],
 )
 def test_equations_with_nominal_values_agree_with_mujoco(case, tolerance):
     simulated, written = case()
