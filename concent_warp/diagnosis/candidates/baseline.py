@@ -16,6 +16,7 @@ from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projecte
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import huber, huber_limit
+from concent_warp.fit.effects.rough_windows import with_rough_windows
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
@@ -95,6 +96,7 @@ def fitted_model(
 ) -> FittedModel:
     """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""
     settings = cfg.least_squares
+    fit = with_rough_windows(Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), settings), fit)
     pieces = tuple(without_bounded(model, projected(fit, settings.robust)))
     limit = huber_limit([piece.residual for piece in pieces], settings.robust)
     errors = held_out_errors(model, block_sums(pieces, blocks, limit), blocks, settings.prior)

@@ -321,14 +321,21 @@ def _plausibility(base: FittedModel, c: FittedCandidate, f: Finding) -> float:
 def surprise(effect: Effect, parameters: Sequence[Parameter], values: Sequence[float], count: int) -> float:
     """Return minus twice the log prior of an effect, up to a constant: its rarity, number of parameters, and sizes.
 
+    Joints of a machine are alike. Where an effect acts on several, how large it is counts once, by the largest of them,
+    not for each as if they had nothing to do with each other; what they differ by is in the number of parameters.
+
     Args:
         effect: The effect.
         parameters: Its parameters.
         values: Their values.
         count: Observations, for Schwarz's criterion.
     """
-    sizes = _sizes(parameters, values)
-    return float(2 * np.log1p(sizes**2).sum() + len(sizes) * np.log(count) + effect.rarity)
+    largest: dict[str, float] = {}
+    for p, size in zip(parameters, np.abs(_sizes(parameters, values)), strict=True):
+        kind = p.name.partition("[")[0]
+        largest[kind] = max(largest.get(kind, 0.0), float(size))
+    charge = 2 * sum(np.log1p(size**2) for size in largest.values())
+    return float(charge + len(parameters) * np.log(count) + effect.rarity)
 
 
 def largest_size(base: FittedModel, c: FittedCandidate) -> float:

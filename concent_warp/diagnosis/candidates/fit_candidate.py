@@ -14,6 +14,7 @@ from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.least_squares import Fit, Solver
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.robust import robust_noise_ratio
+from concent_warp.fit.effects.rough_windows import with_rough_windows
 
 
 def candidate_solver(base: FittedModel, effect: Effect, windows: Sequence[Window] = ()) -> Solver:
@@ -23,7 +24,7 @@ def candidate_solver(base: FittedModel, effect: Effect, windows: Sequence[Window
 
 def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit) -> FittedCandidate:
     """Return a fit of a candidate with its residuals and held-out errors."""
-    model = solver.p.model(fit.values)
+    model, fit = solver.p.model(fit.values), with_rough_windows(solver, fit)
     pieces = tuple(without_bounded(model, base.projected(fit)))
     sums, prior = base.held_out(pieces).sums, base.cfg.least_squares.prior
     errors = held_out_errors(model, sums, base.blocks, prior)

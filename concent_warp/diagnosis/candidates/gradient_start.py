@@ -15,7 +15,7 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.candidates.fit_candidate import candidate_solver
-from concent_warp.diagnosis.candidates.screening import projected_residuals, robust_sum
+from concent_warp.diagnosis.candidates.screening import foretold_residuals, projected_residuals, robust_sum
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Effect
 from concent_warp.errors import ConcentError
@@ -93,7 +93,7 @@ def start_from_factor(base: FittedModel, screened: ScreenedCandidate, factor: fl
     own = solver.p.split[-1]
     values[own] = _scaled(effect, values[own], factor)
     values = solver.inside(values)
-    before = robust_sum(base, [piece.residual for piece in base.pieces])
+    before = robust_sum(base, foretold_residuals(base))
     best = screened
     for measured in (False, True):
         offsets = [np.zeros_like(o) if measured else o for o in base.fit.offsets]

@@ -137,6 +137,12 @@ def projected_residuals(
     return found
 
 
+def foretold_residuals(base: FittedModel) -> list[np.ndarray]:
+    """Return what `projected_residuals` are compared with: those of the baseline, in `Fit.rough` windows too."""
+    pieces = base.projected(replace(base.fit, rough=())) if base.fit.rough else base.pieces
+    return [piece.residual for piece in pieces]
+
+
 def robust_sum(base: FittedModel, residuals: Sequence[np.ndarray]) -> float:
     """Return the robust sum of squares of projected residuals."""
     return float(2 * sum(huber(r, base.limit).sum() for r in residuals))
@@ -165,7 +171,7 @@ def _scan(
         cfg: Settings.
     """
     best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
-    before = np.array([robust_sum(base, [piece.residual]) for piece in base.pieces])
+    before = np.array([robust_sum(base, [residual]) for residual in foretold_residuals(base)])
     order = np.argsort(before)[::-1]
     count = int(np.searchsorted(np.cumsum(before[order]), cfg.first_scanned_share * before.sum())) + 1
     first, rest = order[:count].tolist(), order[count:].tolist()

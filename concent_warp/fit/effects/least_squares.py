@@ -126,6 +126,9 @@ class Fit:
     """Whether a thorough polish ended here, so that another one finds nothing."""
     searched: np.ndarray | None = None
     """Parameters, shape (P,), at which a polish searched initial states from the measured ones last; None for none."""
+    rough: tuple[int, ...] = ()
+    """Windows, by index, in which no step of the initial state lowers the residuals as its derivatives foretell; see
+    `concent_warp.fit.effects.rough_windows`."""
 
     @property
     def is_searched(self) -> bool:
@@ -279,7 +282,7 @@ class Solver:
         part = Solver(self.p.only(some), self.cfg)
         linear, offsets, starts = (tuple(rows[w] for w in some) for rows in (fit.linear, fit.offsets, fit.starts))
         cost = part.cost([window.residual for window in linear], offsets, fit.values)
-        begin = replace(fit, linear=linear, offsets=offsets, starts=starts, cost=cost)
+        begin = replace(fit, linear=linear, offsets=offsets, starts=starts, cost=cost, rough=())
         found = part.polish(begin, thorough=thorough, stuck=stuck)
         min_gain = self.cfg.min_thorough_gain if thorough else self.cfg.min_gain
         if found.cost > (1 - min_gain) * begin.cost:
@@ -334,9 +337,8 @@ class Solver:
                     offsets[w], starts[w], residuals[w] = there[w], found[w], left[w]
         linear = self.linearise(fit.values, offsets)
         cost = self.cost([window.residual for window in linear], offsets, fit.values)
-        return replace(
-            fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in range(len(starts))), linear=linear, cost=cost
-        )
+        ordered = tuple(starts[w] for w in range(len(starts)))
+        return replace(fit, offsets=tuple(offsets), starts=ordered, linear=linear, cost=cost, rough=())
 
     def fit_at_states_of(self, other: Fit, fit: Fit) -> Fit:
         """Return a fit of the parameters at the initial states of another fit, which stay fixed.
@@ -350,7 +352,8 @@ class Solver:
         def at(values: np.ndarray) -> Fit:
             linear = self.linearise(values, other.offsets)
             cost = self.cost([window.residual for window in linear], other.offsets, values)
-            return replace(fit, values=values, offsets=other.offsets, starts=other.starts, linear=linear, cost=cost)
+            moved = {"offsets": other.offsets, "starts": other.starts, "rough": ()}
+            return replace(fit, values=values, linear=linear, cost=cost, **moved)
 
         best, size = at(fit.values), 1.0
         for _ in range(self.cfg.polish_steps):
@@ -577,9 +580,9 @@ class Solver:
 
     def prior(self, values: np.ndarray) -> np.ndarray:
         """Return the parameters' distances from the mean of their prior, in units of its standard deviation."""
-        mean = np.where(np.isfinite(self.p.prior_mean), self.p.prior_mean, values)
-        finite = np.isfinite(values)
-        return np.where(finite, (values - mean) / (self.cfg.prior * self.scale), 0.0)
+        mean = self.p.prior_mean
+        away = np.subtract(values, mean, out=np.zeros(len(values)), where=np.isfinite(values) & np.isfinite(mean))
+        return away / (self.cfg.prior * self.scale)
 
     def cost(
         self,
@@ -662,22 +665,31 @@ def projected(fit: Fit, cfg: RobustLossCfg | None = None) -> list[Linear]:
     """Return residuals and sensitivities with the initial states eliminated, window by window.
 
     They are those parts that no change of the initial state within its prior can explain; a sensitivity that such a
-    change explains but for `LEAST_SHARE` and `LEAST_CHANGE` is 0.
+    change explains but for `LEAST_SHARE` and `LEAST_CHANGE` is 0. Residuals of `Fit.rough` windows are as they are.
 
     Args:
         fit: The fit.
         cfg: Scales of the robust losses.
     """
     found = []
-    for window, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
+    for w, (window, a, o) in enumerate(zip(fit.linear, fit.starts, fit.offsets, strict=True)):
         near = cauchy_weight(o, cfg)
         m = a.T @ a + np.diag(near)
-        both = np.column_stack([window.jacobian, window.residual])
-        inner = a.T @ both
-        inner[:, -1] += near * o
-        rest = both - a @ np.linalg.solve(m, inner)
-        jacobian, whole = rest[:, :-1], np.linalg.norm(window.jacobian, axis=0)
+        jacobian, whole = window.jacobian - a @ np.linalg.solve(m, a.T @ window.jacobian), window.jacobian
         left = np.linalg.norm(jacobian, axis=0)
-        determined = (left > LEAST_SHARE * whole) | (left > LEAST_CHANGE * np.sqrt(len(jacobian)))
-        found.append(replace(window, jacobian=jacobian * determined, residual=rest[:, -1]))
+        determined = left > LEAST_SHARE * np.linalg.norm(whole, axis=0)
+        determined |= left > LEAST_CHANGE * np.sqrt(len(jacobian))
+        residual = window.residual
+        if w not in fit.rough:
+            residual = residual - a @ np.linalg.solve(m, a.T @ residual + near * o)
+        found.append(replace(window, jacobian=jacobian * determined, residual=residual))
+    return found
+
+
+def start_steps(fit: Fit, cfg: RobustLossCfg | None = None) -> list[np.ndarray]:
+    """Return the steps of the initial states that `projected` residuals foretell, in units of their spread."""
+    found = []
+    for window, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
+        near = cauchy_weight(o, cfg)
+        found.append(-np.linalg.solve(a.T @ a + np.diag(near), a.T @ window.residual + near * o))
     return found

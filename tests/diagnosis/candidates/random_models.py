@@ -13,7 +13,7 @@ from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cross_validation import Blocks
 from concent_warp.fit.effects.least_squares import Linear
 
-ANY: Any = None
+ANY: Any = SimpleNamespace(rough=())
 LIMIT = 2.0
 ROWS, COUNT = 40, 8
 

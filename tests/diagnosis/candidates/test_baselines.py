@@ -34,6 +34,7 @@ class Fit:
     offsets: Any = (np.array([0.5]),)
     starts: Any = "starts"
     polished: bool = False
+    rough: Any = ()
 
 
 @pytest.mark.parametrize(("values", "polished"), [((1.0,), True), ((), False)])

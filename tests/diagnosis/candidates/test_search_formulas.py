@@ -230,6 +230,11 @@ def test_a_size_is_no_surprise_below_what_is_typical():
         assert surprise(effect, sizes, [1.0], 1) == 0
         assert surprise(effect, sizes, [1.0 + unit], 1) == pytest.approx(2 * np.log(2))
         assert surprise(effect, 3 * sizes, 3 * [1.0], 10) == pytest.approx(3 * np.log(10))
+    # Joints of a machine are alike: that an effect is large in all of them is one surprise, not one for each.
+    joints = [Parameter(f"a[{k}]", "-", 0.0, 0.0, 9.0, 1.0) for k in range(4)]
+    other = Parameter("b[0]", "-", 0.0, 0.0, 9.0, 1.0)
+    assert surprise(effect, joints, [1.0, -2.0, 0.0, 1.0], 1) == pytest.approx(2 * np.log(5))
+    assert surprise(effect, [*joints, other], [1.0, -2.0, 0.0, 1.0, 1.0], 1) == pytest.approx(2 * np.log(5 * 2))
     rare: Any = SimpleNamespace(rarity=6.0)
     assert surprise(rare, [Parameter("a", "-", np.inf, 0.0, 9.0, 0.3)], [5.0], 1) == 6
 

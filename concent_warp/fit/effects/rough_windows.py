@@ -1,0 +1,65 @@
+"""Windows in which the derivatives by the initial state foretell a fit that no step of it attains.
+
+Where a body slides and rolls, or lands, residuals jump a little from one initial state to the next. Derivatives are those
+of the jumps then, and a linear step along them seems to explain what no initial state does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from concent_warp.fit.effects.least_squares import Fit, Solver, projected, start_steps
+from concent_warp.fit.effects.prediction import SimulationRequest
+
+DOUBTED = 0.25
+"""Share of a window's sum of squares that a step of its initial state must foretell to be tried [-]. Empirical."""
+LENGTHS = (1.0, 0.3, 0.1)
+"""Lengths of the step that are tried [-]."""
+
+
+def with_rough_windows(solver: Solver, fit: Fit) -> Fit:
+    """Return a fit that says in which windows no step of the initial state lowers the residuals as foretold.
+
+    A step counts that attains `LeastSquaresCfg.predicted_share` of what is foretold. Windows without contacts are not
+    tried, nor those that leave no more than noise.
+
+    Args:
+        solver: The solver of the fit.
+        fit: The fit.
+    """
+    doubted = _doubted(solver, fit)
+    if not doubted:
+        return replace(fit, rough=())
+    steps = start_steps(fit, solver.cfg.robust)
+    trials = [
+        SimulationRequest(w, fit.values, (fit.offsets[w] + length * steps[w]) * solver.p.windows[w].spread)
+        for w in doubted
+        for length in LENGTHS
+    ]
+    found = [float(r @ r) for r in solver.p.residuals(trials)]
+    rough = []
+    for k, (w, foretold) in enumerate(doubted.items()):
+        least = min(found[k * len(LENGTHS) : (k + 1) * len(LENGTHS)])
+        if _square(fit.linear[w].residual) - least < solver.cfg.predicted_share * foretold:
+            rough.append(w)
+    return replace(fit, rough=tuple(rough))
+
+
+def _doubted(solver: Solver, fit: Fit) -> dict[int, float]:
+    """Return the foretold falls of the sum of squares by window, where these are large."""
+    found = {}
+    linear = projected(replace(fit, rough=()), solver.cfg.robust)
+    for w, (now, foretold) in enumerate(zip(fit.linear, linear, strict=True)):
+        square, fall = _square(now.residual), _square(now.residual) - _square(foretold.residual)
+        noise = solver.cfg.noise_ratio**2 * len(now.residual)
+        if not solver.p.windows[w].smooth and square > noise and fall > DOUBTED * square:
+            found[w] = fall
+    return found
+
+
+def _square(residual: Sequence[float] | np.ndarray) -> float:
+    """Return the sum of squares."""
+    return float(np.dot(residual, residual))
