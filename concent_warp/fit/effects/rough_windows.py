@@ -1,7 +1,7 @@
 """Windows in which the derivatives by the initial state foretell a fit that no step of it attains.
 
-Where a body slides and rolls, or lands, residuals jump a little from one initial state to the next. Derivatives are those
-of the jumps then, and a linear step along them seems to explain what no initial state does.
+Where a body slides and rolls, or lands, residuals jump a little from one initial state to the next. Derivatives are
+those of the jumps then, and a linear step along them seems to explain what no initial state does.
 """
 
 from __future__ import annotations
