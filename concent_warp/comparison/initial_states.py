@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Positive, PositiveDuration
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch
-from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, Window, first_time
+from concent_warp.fit.effects.observation import (
+    NumericalScatter,
+    ObservationCfg,
+    ObservedRecording,
+    Window,
+    first_part,
+    first_time,
+)
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import huber, huber_limit
@@ -30,6 +38,14 @@ class FittedStartCfg:
     length: float = 1.0
     """Readings up to this time after the first one count [s]; less where small differences grow faster. Longer than it
     takes to tell a velocity, short enough for models that are far off."""
+    first_readings: PositiveDuration = 0.05
+    """Time from the first reading on over which a replay must show what was read [s]. A model that is far off follows
+    later readings better from a start that these exclude, such as within a table, and then seems to fail there."""
+    max_first_error: Positive = 4.0
+    """Largest RMS error of a channel there over its noise [-], or that from the measured state where it is larger. Of
+    replays with this noise alone, none comes near."""
+    first_weights: tuple[Positive, ...] = (3.0, 10.0, 30.0, 100.0)
+    """What the noise of these readings is divided by, one after the other until a replay shows them [-]."""
     max_steps: int = 400_000
     """Most simulation steps for a second fit, to all readings of a demonstration [-]; with more, only the first counts.
     A second of computation."""
@@ -74,7 +90,8 @@ def with_initial_states(
     first = [w for number in unknown if (w := _first_window(source, number, engine, cfg.length)) is not None]
     if not first:
         return stated
-    offsets = _fitted(model, first, [np.zeros(len(w.spread)) for w in first], engine, cfg, cfg.search.iterations)
+    fits = _StartFits(model, engine, cfg)
+    offsets = fits.fitted(first)
     step, few = model.scene.model.opt.timestep, cfg.few_iterations
     for k, w in enumerate(first):
         last = _last_time(w.demonstration, list(source.noise))
@@ -82,7 +99,7 @@ def with_initial_states(
         if last > w.end and few * trials * last / step <= cfg.max_steps:
             whole = source.window(w.number, 0.0, last)
             if whole is not None:
-                (offsets[k],) = _fitted(model, [replace(whole, spread=w.spread)], [offsets[k]], engine, cfg, few)
+                offsets[k] = fits.refitted(replace(whole, spread=w.spread), offsets[k])
     starts = {w.number: _moved(model, w, o) for w, o in zip(first, offsets, strict=True)}
     demonstrations = []
     for number, d in enumerate(stated.demonstrations):
@@ -115,18 +132,94 @@ def _last_time(d: Demonstration, channels: Sequence[str]) -> float:
     return max((float(d.measured[c].time[-1]) for c in channels if c in d.measured), default=0.0)
 
 
-def _fitted(
-    model: Model,
-    windows: Sequence[Window],
-    offsets: Sequence[np.ndarray],
-    engine: EngineName,
-    cfg: FittedStartCfg,
-    iterations: int,
-) -> list[np.ndarray]:
-    """Return the errors of the initial states of windows, in units of their spread, each window by itself."""
-    prediction = Prediction(model, (), windows, engine=engine, at_true_time=True)
-    search = InitialStateSearch(prediction, cfg.search)
-    return search.refined(prediction.start, offsets, range(len(windows)), iterations)[0]
+@dataclass(frozen=True)
+class _StartFits:
+    """Fits errors of the initial states of windows, in units of their spread, each window by itself."""
+
+    model: Model
+    engine: EngineName
+    cfg: FittedStartCfg
+
+    def fitted(self, windows: Sequence[Window]) -> list[np.ndarray]:
+        """Return the errors of the measured states."""
+        none = [np.zeros(len(w.spread)) for w in windows]
+        return self._shown(windows, none, self._first_errors(windows, none), self.cfg.search.iterations)
+
+    def refitted(self, whole: Window, offset: np.ndarray) -> np.ndarray:
+        """Return the error that follows all readings of a demonstration best, found from that of the first ones."""
+        shown = self._first_errors([whole], [offset])
+        (found,) = self._shown([whole], [offset], shown, self.cfg.few_iterations)
+        return found
+
+    def _shown(
+        self,
+        windows: Sequence[Window],
+        begin: Sequence[np.ndarray],
+        shown: Sequence[Mapping[str, float]],
+        iterations: int,
+    ) -> list[np.ndarray]:
+        """Return fitted errors, first readings weighted where it takes that for a replay to show them.
+
+        Args:
+            windows: What is fitted.
+            begin: Errors from which the search begins.
+            shown: Errors of first readings by channel that are allowed even if they are large.
+            iterations: Most iterations.
+        """
+        found, pending = list(begin), list(range(len(windows)))
+        for weight in (1.0, *self.cfg.first_weights):
+            some = [self._weighted(windows[k], weight) for k in pending]
+            fits = self._fit(some, [begin[k] for k in pending], iterations)
+            errors = self._first_errors([windows[k] for k in pending], fits)
+            for k, offset in zip(pending, fits, strict=True):
+                found[k] = offset
+            pending = [k for k, e in zip(pending, errors, strict=True) if not self._shows(e, shown[k])]
+            if not pending:
+                break
+        return found
+
+    def _head(self, w: Window) -> Window:
+        """Return the part of a window with its first readings."""
+        return first_part(w, float(w.clock.min()) - w.start + self.cfg.first_readings)
+
+    def _weighted(self, w: Window, weight: float) -> Window:
+        """Return a window that has its first readings once more, their noise divided by a weight above 1."""
+        if weight <= 1.0:
+            return w
+        head, n = self._head(w), w.count
+        again = tuple(
+            replace(r, rows=slice(n + r.rows.start, n + r.rows.stop), std=r.std / weight) for r in head.readings
+        )
+        common = None if w.common is None or head.common is None else np.vstack([w.common, weight * head.common])
+        return replace(
+            w,
+            readings=w.readings + again,
+            count=n + head.count,
+            clock=np.concatenate([w.clock, head.clock]),
+            common=common,
+            scatter=None if common is None else NumericalScatter(common),
+        )
+
+    def _fit(self, windows: Sequence[Window], offsets: Sequence[np.ndarray], iterations: int) -> list[np.ndarray]:
+        """Return fitted errors."""
+        prediction = Prediction(self.model, (), windows, engine=self.engine, at_true_time=True)
+        search = InitialStateSearch(prediction, self.cfg.search)
+        return search.refined(prediction.start, offsets, range(len(windows)), iterations)[0]
+
+    def _first_errors(self, windows: Sequence[Window], offsets: Sequence[np.ndarray]) -> list[dict[str, float]]:
+        """Return the RMS errors of first readings over their noise by channel, for each window."""
+        heads = [self._head(w) for w in windows]
+        prediction = Prediction(self.model, (), heads, engine=self.engine, at_true_time=True)
+        trials = [SimulationRequest(k, prediction.start, o * heads[k].spread) for k, o in enumerate(offsets)]
+        residuals = prediction.residuals(trials)
+        return [
+            {reading.channel: float(np.sqrt(np.mean(r[reading.rows] ** 2))) for reading in w.readings}
+            for w, r in zip(heads, residuals, strict=True)
+        ]
+
+    def _shows(self, errors: Mapping[str, float], before: Mapping[str, float]) -> bool:
+        """Return whether a start leaves no first readings beyond their noise that another one did not leave."""
+        return all(error <= max(self.cfg.max_first_error, before[channel]) for channel, error in errors.items())
 
 
 def _moved(model: Model, w: Window, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

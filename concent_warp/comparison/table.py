@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 DISPENSABLE = ("samples", "p95", "max", "RMS", "noise")
-"""Columns that a narrow terminal does without, the first ones first; --markdown and --json have all."""
+"""Columns that a narrow terminal does without, the first ones first, which is said below the table."""
 
 
 def mean_and_interval(summary: Summary) -> str:
@@ -74,14 +74,17 @@ def rich_table(comparison: Comparison, *, every_phase: bool = False, width: int 
     Args:
         comparison: The comparison.
         every_phase: Whether channels that are not about bodies have a row for each phase too.
-        width: Columns of the terminal; figures that do not fit are left out, the least telling first. None keeps all.
+        width: Columns of the terminal; figures that do not fit are left out, the least telling first, and named below
+            the table. None keeps all.
     """
     from rich.table import Table
 
     header, rows = _cells(comparison, every_phase=every_phase)
+    left_out: list[str] = []
     if width is not None:
-        header, rows = _narrowed(header, rows, width)
-    table = Table(header_style="bold")
+        header, rows, left_out = _narrowed(header, rows, width)
+    caption = f"too narrow for {', '.join(left_out)}: --json has all" if left_out else None
+    table = Table(header_style="bold", caption=caption, caption_justify="left")
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if name in ("channel", "phase", "unit") else "right", no_wrap=i == 0)
     for i, row in enumerate(rows):
@@ -90,10 +93,11 @@ def rich_table(comparison: Comparison, *, every_phase: bool = False, width: int 
     return table
 
 
-def _narrowed(header: list[str], rows: list[list[str]], width: int) -> tuple[list[str], list[list[str]]]:
-    """Return a table that fits: without some columns, then without all intervals but the last model's, then with the
-    phases below the channel.
+def _narrowed(header: list[str], rows: list[list[str]], width: int) -> tuple[list[str], list[list[str]], list[str]]:
+    """Return a table that fits, and what was left out: some columns, then all intervals but the last model's. Then the
+    phases stand below the channel.
     """
+    left_out: list[str] = []
 
     def fits() -> bool:
         longest = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
@@ -104,14 +108,16 @@ def _narrowed(header: list[str], rows: list[list[str]], width: int) -> tuple[lis
             at = header.index(name)
             header = [*header[:at], *header[at + 1 :]]
             rows = [[*row[:at], *row[at + 1 :]] for row in rows]
+            left_out.append(name)
     means = [i for i, name in enumerate(header) if name.startswith("mean ")]
     for at in (*means[:-1], *(i for i, name in enumerate(header) if name == "change")):
         if not fits():
+            left_out += [f"interval of {header[at]}"] if any(" [" in row[at] for row in rows) else []
             rows = [[*row[:at], row[at].partition(" [")[0], *row[at + 1 :]] for row in rows]
     if not fits():
         header = [name.removeprefix("mean ") for name in (header[0], *header[2:])]
         rows = [[channel or f"  {phase}", *rest] for channel, phase, *rest in rows]
-    return header, rows
+    return header, rows, left_out
 
 
 def markdown_table(comparison: Comparison, *, every_phase: bool = False) -> str:

@@ -24,6 +24,9 @@ def replay(
 ) -> dict[str, Rollout]:
     """Replay the commands of each demonstration in a model, from its recorded initial state.
 
+    Where there is none, a replay starts from the first readings, at rest where no velocity was read. The command
+    ``concent replay`` fits the initial state first, as `compare` does.
+
     Args:
         model: The model.
         recording: What was commanded.

@@ -1,13 +1,16 @@
 import json
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.cli import main
+from concent_warp.comparison.initial_states import with_initial_states
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.examples import example
 from concent_warp.model import Model
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 
 
@@ -48,6 +51,24 @@ def test_replay_writes_a_file_for_each_demonstration(bench, tmp_path):
     with np.load(tmp_path / "one.npz", allow_pickle=False) as one, np.load(tmp_path / "r_demo_1.npz") as two:
         assert np.array_equal(one["qpos"], two["qpos"])
         assert "sensor/block_position" in one
+
+
+def test_replay_starts_where_compare_does_and_says_so(bench, tmp_path, capsys):
+    recording = load_recording(bench / "demo.h5").only(["demo_0"])
+    model, moved = Model.load(bench / "inset.toml"), tmp_path / "moved.h5"
+    (d,) = recording.demonstrations
+    unstated = replace(recording, demonstrations=(replace(d, qpos=None, qvel=None),))
+    write_hdf5(unstated, moved)
+    for path, fitted in ((moved, True), (bench / "demo.h5", False)):
+        out = tmp_path / f"{path.stem}.npz"
+        arguments = ["replay", str(path), "--model", str(bench / "inset.toml"), "--demonstrations", "demo_0"]
+        assert main([*arguments, "--out", str(out)]) == 0
+        assert ("initial state fitted to the first readings: demo_0" in capsys.readouterr().out) == fitted
+        (started,) = with_initial_states(model, load_recording(path).only(["demo_0"])).demonstrations
+        with np.load(out, allow_pickle=False) as saved:
+            for name, value in (("qpos", started.qpos), ("qvel", started.qvel)):
+                assert value is not None
+                np.testing.assert_array_equal(saved[name].reshape(-1, len(value))[0], value)
 
 
 def test_events_writes_the_sequence_and_its_picture(bench, tmp_path, capsys):

@@ -186,6 +186,16 @@ def test_the_table_fits_a_narrow_terminal_and_keeps_what_matters(comparison, wid
     assert all(word in out.getvalue() for word in ("pick", "push"))
 
 
+def test_a_narrow_table_says_which_columns_it_leaves_out(comparison):
+    wide, narrow = (rich_table(comparison, width=width) for width in (200, 80))
+    assert wide.caption is None
+    caption = str(narrow.caption)
+    shown = [str(column.header) for column in narrow.columns]
+    for name in ("samples", "p95", "max", "RMS", "noise"):
+        assert (name in shown) != (name in caption.replace("x noise", ""))
+    assert caption.endswith("--json has all")
+
+
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [(0.0123, "m", "12.3"), (np.pi, "rad", "180"), (0.5, "N", "0.50"), (None, "m", "-"), (np.inf, "m", "diverged")],

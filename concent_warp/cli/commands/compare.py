@@ -26,7 +26,8 @@ from concent_warp.run_folder import claim_file, command_line, make_folder, plain
 @dataclass(frozen=True)
 class Arguments:
     """Compare what a model predicts with what was measured: by channel and phase, against the measurement noise, and
-    where it fails worst; with a baseline, say what has changed.
+    where it fails worst; with a baseline, say what has changed. Where the recording does not state the initial state,
+    a replay starts from one that is fitted to the first readings.
     """
 
     recording: tyro.conf.Positional[Path]
