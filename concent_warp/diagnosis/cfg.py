@@ -307,6 +307,10 @@ class NominalCfg:
     max_bounded_share: Share = 0.5
     """Share of the fitted values that may be at their bounds where an error in the formula of an effect is left [-]:
     more at once are less plausible than something that is missing. Empirical."""
+    bounded_remainder: Share = 0.025
+    """Share of the discrepancy of the model as given below which such values may leave more, up to
+    `DiagnoseCfg.adequate_ratio`, where no effect has been added [-]: what friction and drives have in common with their
+    formulas is right to a tenth or so, a hundredth or two in squares. Empirical."""
 
 
 @dataclass(frozen=True)

@@ -253,17 +253,19 @@ class Additions:
         """Return the fitted models, the last with nominal values and, where that explains more, a shorter time step.
 
         It is None where nominal values explain nothing more. Beside an effect they may be at their bounds where they
-        leave no more than an error in its formula, which they take up before another effect does.
+        leave no more than an error in its formula, which they take up before another effect does; without one, where
+        they leave next to nothing of the discrepancy.
         """
-        enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
-        both = None if finer is None else self._nominal(finer, enough)
-        plain = self._nominal(fitted[-1], enough, with_step=len(fitted) > 1 and finer is None)
+        added = len(fitted) > 1
+        enough = partial(self.context.is_form_error if added else self.context.is_little, first=first)
+        both = None if finer is None else self._nominal(finer, enough, dependent=added)
+        plain = self._nominal(fitted[-1], enough, dependent=added, with_step=added and finer is None)
         if finer is not None and both is not None and (plain is None or self._needs_step(plain, both)):
             return [*self._adopt(fitted, finer)[:-1], both]
         return None if plain is None else [*fitted[:-1], plain]
 
     def _nominal(
-        self, one: FittedModel, enough: Callable[[FittedModel], bool] | None, *, with_step: bool = False
+        self, one: FittedModel, enough: Callable[[FittedModel], bool], *, dependent: bool, with_step: bool = False
     ) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
 
@@ -273,10 +275,11 @@ class Additions:
         Args:
             one: The fitted model.
             enough: Whether a model with values at their bounds leaves little enough.
+            dependent: See `with_nominal_values`.
             with_step: Whether to try a shorter time step beside them.
         """
         context, holding = self.context, self.context.record.holding
-        found = context.nominal_fit(one, dependent=enough is not None)
+        found = context.nominal_fit(one, dependent=dependent)
         if found is None:
             return None
         held = self.with_holding(found)

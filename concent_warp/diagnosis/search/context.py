@@ -89,6 +89,18 @@ class SearchContext:
             share = self.cfg.small_form_error if small else 0.0
         return left < share * lacked
 
+    def is_little(self, one: FittedModel, first: FittedModel) -> bool:
+        """Return whether a model without added effects leaves next to nothing of the discrepancy of the first one.
+
+        See `NominalCfg.bounded_remainder`.
+
+        Args:
+            one: The fitted model.
+            first: The model as given.
+        """
+        left, lacked = discrepancies(one, first)
+        return one.ratio <= self.cfg.adequate_ratio and left < self.cfg.nominal.bounded_remainder * lacked
+
     def explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
         """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.
 

@@ -201,8 +201,8 @@ def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of
         assert (cfg, min_gain) == (made.context.cfg.nominal, 0.2 if one is given else 0.04)
         return one
 
-    def within(_found, _cfg, enough=None):
-        asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
+    def within(_found, _cfg, enough):
+        asked.append([enough(node(r)) for r in (1.2, 1.26, 1.5, 1.8)])
         return True
 
     monkeypatch.setattr(context, "with_nominal_values", nominal)
@@ -211,8 +211,8 @@ def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of
     monkeypatch.setattr(made.additions, "with_holding", lambda one: one)
     made.additions._with_nominal([given], None, given)
     made.additions._with_nominal([given, after], None, given)
-    # 5.2 % and 9.3 % of the discrepancy.
-    assert asked == [None, [True, False]]
+    # 1.8, 2.4, 5.2 and 9.3 % of the discrepancy.
+    assert asked == [[True, False, False, False], [True, True, True, False]]
 
 
 @pytest.mark.parametrize(
