@@ -92,9 +92,9 @@ class AdditionFinder:
         if not screened:  # the model has all that were asked for
             return None, ()
         quiet = least_ratio(base, context.noise_factors) <= cfg.search.explained_ratio
+        small = quiet and explained and step == 0 and self._is_as_given(base)
         if quiet:
             # What shows in the size of the residual no more than noise does must show the clearer in its structure.
-            small = explained and step == 0 and self._is_as_given(base)
             least_small = cfg.min_gain if context.record.beside_impacts else cfg.small_min_gain
             least_gain = least_small if small else cfg.quiet_min_gain
             cfg = replace(cfg, significance_level=cfg.quiet_significance_level, min_gain=least_gain)
@@ -140,7 +140,7 @@ class AdditionFinder:
         elif not quiet:
             findings = with_scattering(base, fitted, findings, cfg.search)
         if beside is not None and beside_nominal:
-            findings = self._beyond_nominal(beside, fitted, findings, step)
+            findings = self._beyond_nominal(beside, fitted, findings, step, small=small)
         whole = [f for f in findings if f.accepted and f.gain >= self._least_share(base)]
         context.record.part_refused = not whole and any(f.accepted for f in findings)
         if context.record.part_refused:
@@ -261,7 +261,13 @@ class AdditionFinder:
         return self.context.cfg.nominal.enabled and given
 
     def _beyond_nominal(
-        self, beside: BesideNominalValues, fitted: Sequence[FittedCandidate], findings: Sequence[Finding], step: int
+        self,
+        beside: BesideNominalValues,
+        fitted: Sequence[FittedCandidate],
+        findings: Sequence[Finding],
+        step: int,
+        *,
+        small: bool,
     ) -> list[Finding]:
         """Return findings, accepted ones refused that explain little beyond all nominal values within their tolerance.
 
@@ -273,13 +279,14 @@ class AdditionFinder:
             fitted: The candidates.
             findings: Their evidence, in the same order.
             step: Index of the addition.
+            small: Whether a small effect is enough, see `DiagnoseCfg.small_min_gain`.
         """
         cfg, base = self.context.cfg, beside.base
         factor = least_ratio(base, self.context.noise_factors) / max(base.ratio, 1e-12)
         explained = factor * beside.ratio(base) <= cfg.search.explained_ratio
         if base.ratio > cfg.form_error_ratio and not (step and explained):
             return list(findings)
-        needed = cfg.quiet_min_gain if explained else cfg.min_gain
+        needed = cfg.quiet_min_gain if explained and not small else cfg.min_gain
         reason = "explains little beyond nominal values within their tolerance"
         return [
             replace(f, accepted=False, reason=reason) if f.accepted and not self._removes(beside, c, needed) else f
