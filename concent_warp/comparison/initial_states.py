@@ -44,11 +44,14 @@ class FittedStartCfg:
     max_first_error: Positive = 4.0
     """Largest RMS error of a channel there over its noise [-], or that from the measured state where it is larger. Of
     replays with this noise alone, none comes near."""
+    first_tolerance: Positive = 1.1
+    """By what factor it may be larger than that from the measured state [-]: channels pull at a start against one
+    another."""
     first_weights: tuple[Positive, ...] = (3.0, 10.0, 30.0, 100.0)
-    """What the noise of these readings is divided by, one after the other until a replay shows them [-]."""
+    """These readings are added once more, their noise divided by one after the other, until a replay shows them [-]."""
     max_steps: int = 400_000
-    """Most simulation steps for a second fit, to all readings of a demonstration [-]; with more, only the first counts.
-    A second of computation."""
+    """Most simulation steps for a second fit without such weights, to all readings of a demonstration [-]; with more,
+    only the first counts. A second of computation, a few with weights."""
     few_iterations: int = 3
     """Iterations of the second fit."""
     search: InitialStateCfg = field(default_factory=lambda: InitialStateCfg(iterations=6, restart_samples=0))
@@ -143,37 +146,40 @@ class _StartFits:
     def fitted(self, windows: Sequence[Window]) -> list[np.ndarray]:
         """Return the errors of the measured states."""
         none = [np.zeros(len(w.spread)) for w in windows]
-        return self._shown(windows, none, self._first_errors(windows, none), self.cfg.search.iterations)
+        return self._weighted_fits(windows, none, self._first_errors(windows, none), self.cfg.search.iterations)
 
     def refitted(self, whole: Window, offset: np.ndarray) -> np.ndarray:
         """Return the error that follows all readings of a demonstration best, found from that of the first ones."""
-        shown = self._first_errors([whole], [offset])
-        (found,) = self._shown([whole], [offset], shown, self.cfg.few_iterations)
+        before = self._first_errors([whole], [offset])
+        (found,) = self._weighted_fits([whole], [offset], before, self.cfg.few_iterations)
         return found
 
-    def _shown(
+    def _weighted_fits(
         self,
         windows: Sequence[Window],
         begin: Sequence[np.ndarray],
-        shown: Sequence[Mapping[str, float]],
+        before: Sequence[Mapping[str, float]],
         iterations: int,
     ) -> list[np.ndarray]:
         """Return fitted errors, first readings weighted where it takes that for a replay to show them.
 
+        Where no weight makes a replay show them, that counts which comes nearest.
+
         Args:
             windows: What is fitted.
             begin: Errors from which the search begins.
-            shown: Errors of first readings by channel that are allowed even if they are large.
+            before: RMS errors of first readings by channel from there, which are allowed even if they are large.
             iterations: Most iterations.
         """
-        found, pending = list(begin), list(range(len(windows)))
+        found, pending, least = list(begin), list(range(len(windows))), [np.inf] * len(windows)
         for weight in (1.0, *self.cfg.first_weights):
             some = [self._weighted(windows[k], weight) for k in pending]
             fits = self._fit(some, [begin[k] for k in pending], iterations)
             errors = self._first_errors([windows[k] for k in pending], fits)
-            for k, offset in zip(pending, fits, strict=True):
-                found[k] = offset
-            pending = [k for k, e in zip(pending, errors, strict=True) if not self._shows(e, shown[k])]
+            for k, offset, error in zip(pending, fits, errors, strict=True):
+                if (excess := self._excess(error, before[k])) < least[k]:
+                    found[k], least[k] = offset, excess
+            pending = [k for k in pending if least[k] > 1.0]
             if not pending:
                 break
         return found
@@ -217,9 +223,10 @@ class _StartFits:
             for w, r in zip(heads, residuals, strict=True)
         ]
 
-    def _shows(self, errors: Mapping[str, float], before: Mapping[str, float]) -> bool:
-        """Return whether a start leaves no first readings beyond their noise that another one did not leave."""
-        return all(error <= max(self.cfg.max_first_error, before[channel]) for channel, error in errors.items())
+    def _excess(self, errors: Mapping[str, float], before: Mapping[str, float]) -> float:
+        """Return the largest RMS error of first readings over what is allowed, up to 1 where all are shown [-]."""
+        most, wider = self.cfg.max_first_error, self.cfg.first_tolerance
+        return max((error / max(most, wider * before[channel]) for channel, error in errors.items()), default=0.0)
 
 
 def _moved(model: Model, w: Window, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -309,8 +309,8 @@ class NominalCfg:
     more at once are less plausible than something that is missing. Empirical."""
     bounded_remainder: Share = 0.025
     """Share of the discrepancy of the model as given below which such values may leave more, up to
-    `DiagnoseCfg.adequate_ratio`, where no effect has been added [-]: what friction and drives have in common with their
-    formulas is right to a tenth or so, a hundredth or two in squares. Empirical."""
+    `DiagnoseCfg.adequate_ratio`, where no effect has been added [-]: formulas of friction and drives are right to about
+    10 %, which leaves 1 to 2 % of the squared discrepancy. Empirical."""
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,36 @@ def free_bodies(m: mujoco.MjModel) -> list[int]:
     return [int(m.jnt_bodyid[j]) for j in range(m.njnt) if m.jnt_type[j] == int(JOINT.mjJNT_FREE)]
 
 
-def free_body_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-    """Return one selection for each free body that has a name."""
-    return tuple((n,) for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+def placing_joints(m: mujoco.MjModel) -> list[int]:
+    """Return the joints that only place a body: slides and hinges in place of a free joint, as in a plane.
+
+    These are two slides or more on a body, with its other joints, without drive, coupling, tendon, friction, damping,
+    spring, armature or limit: no bearing has such axes in one body, and what acts on it does so by its contacts and its
+    mass.
+    """
+    driven = [j for a in range(m.nu) for j in driven_joints(m, a)]
+    pulled = m.wrap_objid[m.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)]
+    coupled = m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
+    bound = m.jnt_limited.astype(bool) | (m.jnt_stiffness != 0)
+    bound |= np.isin(np.arange(m.njnt), [*driven, *pulled, *m.eq_obj1id[coupled], *m.eq_obj2id[coupled]])
+    resisted = (m.dof_damping != 0) | (m.dof_frictionloss != 0) | (m.dof_armature != 0)
+    np.logical_or.at(bound, m.dof_jntid, resisted)
+    slides, found = m.jnt_type == int(JOINT.mjJNT_SLIDE), []
+    for body in np.unique(m.jnt_bodyid):
+        mine = np.flatnonzero(m.jnt_bodyid == body)
+        if slides[mine].sum() >= 2 and not bound[mine].any():
+            found += mine.tolist()
+    return found
+
+
+def unguided_bodies(m: mujoco.MjModel) -> list[int]:
+    """Return the bodies that no bearing guides: those with a free joint, or with joints that only place them."""
+    return [*free_bodies(m), *dict.fromkeys(int(m.jnt_bodyid[j]) for j in placing_joints(m))]
+
+
+def unguided_body_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+    """Return one selection for each such body that has a name."""
+    return tuple((n,) for b in unguided_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
 
 
 def fingers(m: mujoco.MjModel) -> list[int]:
@@ -188,7 +215,7 @@ def jointed_contact_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
     Bodies that can touch the same are one selection. There is none where a body moves freely: what it touches, and what
     stands still, is that of its own contacts.
     """
-    if free_bodies(m):
+    if unguided_bodies(m):
         return ()
     touching, body = touchable_pairs(m), m.body_weldid[m.geom_bodyid]
     group = np.arange(m.nbody)

@@ -75,6 +75,7 @@ def test_a_model_that_is_far_off_starts_where_the_first_readings_are():
     assert first_error(wrong, run, FREE) > 20
     assert first_error(wrong, run, LIMITED) < 3
     found = compare_replays({"wrong": wrong}, run, "mujoco")
+    assert found.worst_spans
     assert all(span.start > 0.02 for span in found.worst_spans)
 
 
@@ -99,8 +100,9 @@ def test_what_the_first_readings_do_not_show_stays_free():
     time, value = np.array(rows).T
     channel = Channel(time, value[:, None], noise_std=NOISE / 10)
     run = Recording(xml, (Demonstration("run", measured={"place": channel}),))
-    qpos, _ = start(Model(Scene(xml)), run, LIMITED)
-    assert qpos[1] == pytest.approx(0.3, abs=0.03)
+    for cfg in (LIMITED, replace(LIMITED, max_first_error=1e-6)):  # the latter tries all weights
+        qpos, _ = start(Model(Scene(xml)), run, cfg)
+        assert qpos[1] == pytest.approx(0.3, abs=0.03)
 
 
 def test_first_readings_that_measured_states_miss_as_well_decide_nothing():

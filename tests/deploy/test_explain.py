@@ -198,20 +198,23 @@ def test_effects_are_searched_for_in_the_arm_alone_unless_one_wants_the_object(
     assert ("block_position" in found[0][1]) == (moving == 15)
 
 
-def test_the_model_with_the_missing_effect_is_kept_until_there_is_none(
+def test_the_model_with_the_missing_effect_is_kept_unless_it_has_other_constants_too(
     policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]], tmp_path: Path
 ) -> None:
     given = Recording(policy.run.recording.scene, (prepared[1][1].demonstration,))
     better = policy.run.model.add_effect("actuator_delay", values={"delay": 0.03})
-    found: Any = SimpleNamespace(accepted=("one",), changes_model=True, model=better)
+    as_given = {"accepted": ("one",), "changes_model": True, "model": better, "time_step": None, "holding": ()}
+    found: Any = SimpleNamespace(**as_given)
     explaining = _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, tmp_path / "out")
-    assert explaining._save(found) == str(tmp_path / "out" / "model.toml")
-    (effect,) = cw.load_model(tmp_path / "out" / "model.toml").effects
+    assert explaining._save(found, in_arm_alone=True) == str(tmp_path / "out" / "with_effects.toml")
+    (effect,) = cw.load_model(tmp_path / "out" / "with_effects.toml").effects
     assert effect.values == (0.03,)
-    unchanged: Any = SimpleNamespace(accepted=("one",), changes_model=False)
-    assert explaining._save(unchanged) is None
-    assert not (tmp_path / "out" / "model.toml").exists()
-    assert _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, None)._save(found) is None
+    unchanged: Any = SimpleNamespace(**as_given | {"changes_model": False})
+    assert explaining._save(unchanged, in_arm_alone=True) is None
+    shorter: Any = SimpleNamespace(**as_given | {"time_step": "half"})
+    assert explaining._save(shorter, in_arm_alone=True) is None
+    assert explaining._save(shorter, in_arm_alone=False) is not None
+    assert _Explaining(policy, [given], cw.ExplainCfg(), ignore_progress, None)._save(found, in_arm_alone=True) is None
 
 
 def test_trials_that_all_succeeded_are_refused(

@@ -206,7 +206,7 @@ def test_effects_are_fitted_to_the_free_motion_that_they_were_found_in(tmp_path:
 
 def test_the_model_of_an_explanation_is_taken_as_it_is(tmp_path: Path) -> None:
     setting, one = swinging(tmp_path)
-    ready = tmp_path / "out" / "explanation" / "model.toml"
+    ready = tmp_path / "out" / "explanation" / "with_effects.toml"
     ready.parent.mkdir(parents=True)
     cw.load_model(tmp_path / "model.toml").add_effect("joint_damping").save(ready)
     damping = cw.MissingEffect("joint_damping", ("hinge",), ("damping[hinge]",), (0.5 * DAMPING,))

@@ -15,7 +15,7 @@ from concent_warp.deploy.explain.result import Cause
 FOUND = cast(Any, SimpleNamespace(accepted=[SimpleNamespace(name="joint_friction(joint1, ...)")] * 2))
 
 
-@pytest.mark.parametrize("better", [None, "out/my model.toml"])
+@pytest.mark.parametrize("better", [None, "out/with effects.toml"])
 @pytest.mark.parametrize("free", [None, "out/free motion.h5"])
 @pytest.mark.parametrize("cause", ["perception", "physics", "policy", "unexplained"])
 def test_commands_are_understood(cause: Cause, free: str | None, better: str | None) -> None:

@@ -91,7 +91,7 @@ def test_joints_of_an_actuator_are_those_that_it_moves(m):
 
 def test_bodies_are_selected_by_what_carries_them(m):
     assert bodies(m, select.free_bodies(m)) == ["ball", ""]
-    assert select.free_body_targets(m) == (("ball",),)
+    assert select.unguided_body_targets(m) == (("ball",),)
     assert bodies(m, select.fingers(m)) == ["left", "right"]
     assert bodies(m, select.robot_bodies(m)) == ["base", "bracket", "arm", "left", "right", "third"]
     assert bodies(m, select.outermost_links(m)) == ["third", "cardan", "ground slide", "ground slide too"]

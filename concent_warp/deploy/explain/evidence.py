@@ -67,7 +67,7 @@ class Evidence:
     diagnosis: Diagnosis | None = None
     free_motion: str | None = None
     """File of the free motion that the effect was searched in, where it was and this was written."""
-    better: str | None = None
+    with_effects: str | None = None
     """File of the model with the missing effects, where it was written."""
     preference: str | None = None
     """A sentence on why whole trials prefer its effect to one that explains as much of what it was searched for in."""
@@ -174,7 +174,9 @@ class Judge:
             total=total,
             evidence=numbers,
             remarks=tuple(self._remarks(evidence, cause, numbers)),
-            remedy=remedy(self._policy, cause, evidence.diagnosis, sources, evidence.free_motion, evidence.better),
+            remedy=remedy(
+                self._policy, cause, evidence.diagnosis, sources, evidence.free_motion, evidence.with_effects
+            ),
             diagnosis=evidence.diagnosis,
             bias=evidence.bias,
             simulated=evidence.own.recording,

@@ -39,7 +39,6 @@ from concent_warp.run_folder import make_folder
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.run import MODEL
 
 JOINT_SCALE = 2.5
 """Joint errors over noise of simulated trials where there are none to take it from."""
@@ -62,7 +61,8 @@ def explain(
         recordings: Trials, as `evaluate` records them, or logs of a robot in the scene of the policy's model.
         cfg: Settings.
         out: Folder for what the search for a missing effect has finished, from which the same call continues after an
-            interruption, and for the result, ``explanation.json``, and ``model.toml`` with the effects that it found.
+            interruption, and for the result, ``explanation.json``, and ``with_effects.toml``, the model with the
+            missing effects.
         progress: Called with the share done, 0..1, and what is being done.
 
     Raises:
@@ -88,8 +88,9 @@ def explain(
     return found
 
 
-RESULT, FREE_MOTION = "explanation.json", "free_motion.h5"
-"""Files of the result, and of the robot's free motion in the trials if the effect was searched for in it."""
+RESULT, FREE_MOTION, WITH_EFFECTS = "explanation.json", "free_motion.h5", "with_effects.toml"
+"""Files of the result, of the robot's free motion in the trials if the effect was searched for in it, and of the model
+with the missing effects if there are any."""
 
 
 class _Explaining:
@@ -124,6 +125,8 @@ class _Explaining:
     def run(self) -> Explanation:
         """Return the explanation."""
         cfg, progress = self._cfg, self._progress
+        if self._out is not None:
+            (Path(self._out) / WITH_EFFECTS).unlink(missing_ok=True)  # of an earlier call
         progress(0.0, "finding where the trials began")
         trials = [self._preparation.trial(d) for _, d in self._chosen]
         others = [self._preparation.trial(d) for d in self._succeeded]
@@ -264,7 +267,8 @@ class _Explaining:
         if tried is not model:
             diagnosis = in_whole_scene(diagnosis, model)
         after = self._misfit(evidence, diagnosis.model) if diagnosis.accepted else None
-        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=after, better=self._save(diagnosis))
+        saved = self._save(diagnosis, in_arm_alone=tried is not model)
+        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=after, with_effects=saved)
 
     def _misfit(self, evidence: Evidence, model: Model) -> np.ndarray:
         """Return the misfits of the trials' replays in a model, shape (T,)."""
@@ -290,17 +294,16 @@ class _Explaining:
         write_hdf5(free_motion, path)
         return str(path)
 
-    def _save(self, diagnosis: Diagnosis) -> str | None:
+    def _save(self, diagnosis: Diagnosis, *, in_arm_alone: bool) -> str | None:
         """Save the model with the missing effects where there is a folder for it, and return the file.
 
-        None where the diagnosis leaves the model as it is; one of an earlier call is removed.
+        None where the diagnosis leaves the model as it is, and where it has other constants of the simulator in
+        the arm alone: the values that go with these are not those of the whole scene.
         """
-        if self._out is None:
+        constants = diagnosis.time_step is not None or bool(diagnosis.holding)
+        if self._out is None or not (diagnosis.accepted and diagnosis.changes_model) or (in_arm_alone and constants):
             return None
-        path = Path(self._out) / MODEL
-        if not (diagnosis.accepted and diagnosis.changes_model):
-            path.unlink(missing_ok=True)
-            return None
+        path = Path(self._out) / WITH_EFFECTS
         make_folder(path.parent)
         diagnosis.model.save(path)
         return str(path)

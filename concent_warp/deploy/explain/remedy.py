@@ -33,7 +33,7 @@ def remedy(
     diagnosis: Diagnosis | None,
     sources: Sequence[str],
     free_motion: str | None = None,
-    better: str | None = None,
+    with_effects: str | None = None,
 ) -> tuple[str, ...]:
     """Return commands that mend a cause, each on the line after a comment.
 
@@ -43,7 +43,7 @@ def remedy(
         diagnosis: What was found of missing effects.
         sources: Recordings of the trials.
         free_motion: Recording of the robot's free motion in the trials, if the effect was searched for in it.
-        better: File of the model with the missing effects, if there is one.
+        with_effects: File of the model with the missing effects, if there is one.
     """
     folder = policy.folder
     model, demonstration = shlex.quote(str(folder / MODEL)), shlex.quote(str(folder / DEMONSTRATION))
@@ -56,12 +56,12 @@ def remedy(
             "# until then: train for errors of this size",
             f"concent train {demonstration} --model {model} --out runs/robust {as_options(SETTINGS[cause])}",
         )
-    if cause == "physics" and better is not None:
+    if cause == "physics" and with_effects is not None:
         return (
             "# see what the model with the missing effect explains of the trials",
-            f"concent compare {trials} --model {shlex.quote(better)} --baseline {model}",
+            f"concent compare {trials} --model {shlex.quote(with_effects)} --baseline {model}",
             "# train again in it, over the effect's interval",
-            f"concent train {demonstration} --model {shlex.quote(better)} --out runs/better",
+            f"concent train {demonstration} --model {shlex.quote(with_effects)} --out runs/better",
         )
     if cause == "physics":
         accepted = [] if diagnosis is None else [found.name.partition("(")[0] for found in diagnosis.accepted]

@@ -12,7 +12,7 @@ from typing import Any
 from concent_warp.deploy.cfg import EvaluateCfg
 from concent_warp.deploy.evaluate import evaluate
 from concent_warp.deploy.explain.cfg import ExplainCfg
-from concent_warp.deploy.explain.explain import FREE_MOTION, explain
+from concent_warp.deploy.explain.explain import FREE_MOTION, WITH_EFFECTS, explain
 from concent_warp.deploy.explain.page import write_explanation
 from concent_warp.deploy.improve.cfg import ImproveCfg
 from concent_warp.deploy.improve.mend import Mend, missing_effects
@@ -197,7 +197,7 @@ def with_effects(
 
 def _explained_model(chosen: Mend, folder: Path) -> Path | None:
     """Return the file of the model with missing effects that the explanation of a round wrote; None without one."""
-    path = folder / EXPLANATION / MODEL
+    path = folder / EXPLANATION / WITH_EFFECTS
     return path if chosen.effects and path.is_file() else None
 
 
@@ -223,7 +223,7 @@ def trained(setting: Setting, one: ImprovementRound, chosen: Mend, folder: Path,
     """Return a round whose next policy is trained, from the present one."""
     before = setting.policy(one.policy)
     paths = _explained_model(chosen, folder), folder / MODEL, before.folder / MODEL
-    path = next(one for one in paths if one is not None and one.is_file())
+    path = next(path for path in paths if path is not None and path.is_file())
     cfg = with_settings(training_cfg(setting.cfg, before.run.cfg, one.number), chosen.settings)
     total, demonstration = cfg.ppo.iterations, before.run.recording[0].name
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-import mujoco
-import numpy as np
-
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class, effect_classes
+from concent_warp.effects.select import placing_joints
 from concent_warp.model import Model
-
-DRIVES_OF_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 def candidates(model: Model, channels: Collection[str], names: Sequence[str] = ()) -> list[Effect]:
@@ -29,7 +25,8 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
     """
     m = model.compile()
     chosen = [effect_class(name) for name in names] if names else list(effect_classes().values())
-    placing, found = placing_joints(m), []
+    placing = {m.joint(j).name for j in placing_joints(m)}
+    found: list[Effect] = []
     for kind in chosen:
         for target in (*kind.targets(m), *kind.single_targets(m)):
             if kind.kind == "sensor":
@@ -43,26 +40,6 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
             effect = kind(*target)
             if not has_effect(model, effect):
                 found.append(effect)
-    return found
-
-
-def placing_joints(m: mujoco.MjModel) -> set[str]:
-    """Return the names of joints that only place a body: slides and hinges in place of a free joint, as in a plane.
-
-    These are two slides or more on a body, with its other joints, without drive, tendon, friction, damping, spring or
-    limit: no bearing has such axes in one body, and what acts on it does so by its contacts and its mass.
-    """
-    driven = m.actuator_trnid[np.isin(m.actuator_trntype, DRIVES_OF_JOINTS), 0]
-    pulled = m.wrap_objid[m.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)]
-    bound = m.jnt_limited.astype(bool) | (m.jnt_stiffness != 0)
-    bound |= np.isin(np.arange(m.njnt), [*driven, *pulled])
-    resisted = (m.dof_damping != 0) | (m.dof_frictionloss != 0)
-    np.logical_or.at(bound, m.dof_jntid, resisted)
-    slides, found = m.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE), set()
-    for body in np.unique(m.jnt_bodyid):
-        mine = np.flatnonzero(m.jnt_bodyid == body)
-        if slides[mine].sum() >= 2 and not bound[mine].any():
-            found |= {m.joint(int(j)).name for j in mine}
     return found
 
 

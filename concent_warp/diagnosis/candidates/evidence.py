@@ -321,8 +321,9 @@ def _plausibility(base: FittedModel, c: FittedCandidate, f: Finding) -> float:
 def surprise(effect: Effect, parameters: Sequence[Parameter], values: Sequence[float], count: int) -> float:
     """Return minus twice the log prior of an effect, up to a constant: its rarity, number of parameters, and sizes.
 
-    Joints of a machine are alike. Where an effect acts on several, how large it is counts once, by the largest of them,
-    not for each as if they had nothing to do with each other; what they differ by is in the number of parameters.
+    Joints and drives of a machine are alike. Where an effect acts on several, how large it is counts once, by the
+    largest of them, not for each as if they had nothing to do with each other; what they differ by is in the number of
+    parameters.
 
     Args:
         effect: The effect.
@@ -330,9 +331,9 @@ def surprise(effect: Effect, parameters: Sequence[Parameter], values: Sequence[f
         values: Their values.
         count: Observations, for Schwarz's criterion.
     """
-    largest: dict[str, float] = {}
+    largest, alike = {}, effect.kind in ("joint", "actuator")
     for p, size in zip(parameters, np.abs(_sizes(parameters, values)), strict=True):
-        kind = p.name.partition("[")[0]
+        kind = p.name.partition("[")[0] if alike else p.name
         largest[kind] = max(largest.get(kind, 0.0), float(size))
     charge = 2 * sum(np.log1p(size**2) for size in largest.values())
     return float(charge + len(parameters) * np.log(count) + effect.rarity)

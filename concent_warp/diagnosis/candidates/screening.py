@@ -53,7 +53,7 @@ def screen(
     if far:
         known = (at_measured or linear_at_measured_states(base, cfg)) if taken_over else ()
         linear = solver.linearise(at, zero, known, residual_known=same)
-        there = base.projected(replace(base.fit, linear=linear, offsets=zero))
+        there = base.projected(replace(base.fit, linear=linear, offsets=zero, rough=()))
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
         there, plain = without_outward(base, there), without_outward(base, plain)
         before = base.held_out(plain).own()

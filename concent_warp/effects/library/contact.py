@@ -16,10 +16,10 @@ from concent_warp.effects.select import (
     element_name,
     fingers,
     free_bodies,
-    free_body_targets,
     geoms_of,
     jointed_contact_targets,
     surfaces,
+    unguided_body_targets,
 )
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ class SurfaceEffect(Effect):
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body that collides, and bodies on joints that can touch one another."""
-        found = (*free_body_targets(m), *(jointed_contact_targets(m) if cls.of_joints else ()))
+        """Return each body without bearings that collides, and bodies on joints that can touch one another."""
+        found = (*unguided_body_targets(m), *(jointed_contact_targets(m) if cls.of_joints else ()))
         return tuple(t for t in found if all(cls(*t).applies_to(m, m.body(n).id) for n in t))
 
     def geoms(self, m: mujoco.MjModel) -> np.ndarray:

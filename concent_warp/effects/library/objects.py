@@ -8,7 +8,14 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.select import element_name, free_bodies, moving_as_one, outermost_links, turning_axes
+from concent_warp.effects.select import (
+    element_name,
+    free_bodies,
+    moving_as_one,
+    outermost_links,
+    turning_axes,
+    unguided_body_targets,
+)
 
 EACH_AXIS = "axes"
 AXES = ("axis_x", "axis_y", "axis_z", EACH_AXIS)
@@ -187,8 +194,8 @@ class Size(BodyEffect):
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body."""
-        return tuple((n,) for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        """Return each body without bearings."""
+        return unguided_body_targets(m)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor."""

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.joints import MUJOCO
-from concent_warp.effects.select import element_name, free_bodies
+from concent_warp.effects.select import unguided_body_targets
 from concent_warp.scene.spheres.contact_geometry import SPHERE_GEOM_GROUP as SPHERES
 
 AIR_DENSITY = 1.2
@@ -58,15 +58,15 @@ ball that stops in the air within its flight is followed from there only."""
 
 
 class AirEffect(Effect):
-    """An effect of the air on free bodies, which MuJoCo takes for ellipsoids."""
+    """An effect of the air on bodies without bearings, which MuJoCo takes for ellipsoids."""
 
     family = "world"
     kind = "body"
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return all free bodies together: there is one air."""
-        found = tuple(n for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        """Return all bodies without bearings together: there is one air."""
+        found = tuple(n for (n,) in unguided_body_targets(m))
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:

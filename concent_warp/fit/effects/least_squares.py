@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from concent_warp.checks import Count, Factor, Positive
+from concent_warp.checks import Count, Factor, Positive, Share
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch, start_cost
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
@@ -86,6 +86,11 @@ class LeastSquaresCfg:
     """Most windows that are polished together; of more, a sample is polished first [-]."""
     polish_sample: Count = 8
     """Windows in such a sample [-]."""
+    doubted_share: Share = 0.25
+    """Share of a window's sum of squares that derivatives by its initial state must foretell to fall, for a step along
+    them to be simulated once the fit has ended [-], see `concent_warp.fit.effects.rough_windows`. Empirical."""
+    doubted_step_lengths: tuple[Positive, ...] = (1.0, 0.3, 0.1)
+    """Lengths of that step, relative to the one that leads to the foretold minimum [-]."""
     prior: Positive = 10.0
     """Standard deviation of a parameter's weak prior, in units of its typical scale [-]: wide enough to change no value
     that the data determine."""

@@ -14,17 +14,13 @@ import numpy as np
 from concent_warp.fit.effects.least_squares import Fit, Solver, projected, start_steps
 from concent_warp.fit.effects.prediction import SimulationRequest
 
-DOUBTED = 0.25
-"""Share of a window's sum of squares that a step of its initial state must foretell to be tried [-]. Empirical."""
-LENGTHS = (1.0, 0.3, 0.1)
-"""Lengths of the step that are tried [-]."""
-
 
 def with_rough_windows(solver: Solver, fit: Fit) -> Fit:
     """Return a fit that says in which windows no step of the initial state lowers the residuals as foretold.
 
-    A step counts that attains `LeastSquaresCfg.predicted_share` of what is foretold. Windows without contacts are not
-    tried, nor those that leave no more than noise.
+    The step to the foretold minimum is tried, and parts of it. One counts that attains
+    `LeastSquaresCfg.predicted_share` of what is foretold for it. Windows without contacts are not tried, nor those that
+    leave no more than noise.
 
     Args:
         solver: The solver of the fit.
@@ -33,17 +29,19 @@ def with_rough_windows(solver: Solver, fit: Fit) -> Fit:
     doubted = _doubted(solver, fit)
     if not doubted:
         return replace(fit, rough=())
-    steps = start_steps(fit, solver.cfg.robust)
+    steps, lengths = start_steps(fit, solver.cfg.robust), solver.cfg.doubted_step_lengths
     trials = [
         SimulationRequest(w, fit.values, (fit.offsets[w] + length * steps[w]) * solver.p.windows[w].spread)
         for w in doubted
-        for length in LENGTHS
+        for length in lengths
     ]
-    found = [float(r @ r) for r in solver.p.residuals(trials)]
+    left = np.reshape([_square(r) for r in solver.p.residuals(trials)], (len(doubted), len(lengths)))
+    # Along the step to its minimum a parabola falls by 2 t - t^2 of all that it falls.
+    shares = np.array([2 * t - t**2 for t in lengths])
     rough = []
-    for k, (w, foretold) in enumerate(doubted.items()):
-        least = min(found[k * len(LENGTHS) : (k + 1) * len(LENGTHS)])
-        if _square(fit.linear[w].residual) - least < solver.cfg.predicted_share * foretold:
+    for (w, foretold), squares in zip(doubted.items(), left, strict=True):
+        falls = _square(fit.linear[w].residual) - squares
+        if (falls < solver.cfg.predicted_share * shares * foretold).all():
             rough.append(w)
     return replace(fit, rough=tuple(rough))
 
@@ -55,7 +53,7 @@ def _doubted(solver: Solver, fit: Fit) -> dict[int, float]:
     for w, (now, foretold) in enumerate(zip(fit.linear, linear, strict=True)):
         square, fall = _square(now.residual), _square(now.residual) - _square(foretold.residual)
         noise = solver.cfg.noise_ratio**2 * len(now.residual)
-        if not solver.p.windows[w].smooth and square > noise and fall > DOUBTED * square:
+        if not solver.p.windows[w].smooth and square > noise and fall > solver.cfg.doubted_share * square:
             found[w] = fall
     return found
 

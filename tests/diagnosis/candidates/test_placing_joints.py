@@ -4,7 +4,8 @@ import mujoco
 import pytest
 
 import concent_warp as cw
-from concent_warp.diagnosis.candidates.candidates import candidates, placing_joints
+from concent_warp.diagnosis.candidates.candidates import candidates
+from concent_warp.effects.select import placing_joints, unguided_bodies
 from concent_warp.scene.scene import Scene
 
 PLANE = """
@@ -26,6 +27,8 @@ PLANE = """
 DRIVE = '<actuator><motor joint="x"/></actuator>'
 BELT = '<tendon><fixed><joint joint="z" coef="1"/></fixed></tendon>'
 
+COUPLING = '<equality><joint joint1="x" joint2="hinge"/></equality>'
+
 
 def plane(of_turn: str = "", more: str = "") -> str:
     """Return a scene with a roller in a plane and an arm."""
@@ -34,12 +37,16 @@ def plane(of_turn: str = "", more: str = "") -> str:
 
 def test_joints_of_a_body_in_a_plane_only_place_it() -> None:
     model = cw.Model(Scene(plane()))
-    assert placing_joints(model.compile()) == {"x", "z", "turn"}
+    m = model.compile()
+    assert [m.joint(j).name for j in placing_joints(m)] == ["x", "z", "turn"]
+    assert [m.body(b).name for b in unguided_bodies(m)] == ["roller"]
     friction = [e.target for e in candidates(model, ["position"]) if e.name == "joint_friction"]
     assert friction == [("hinge",)]
     asked = [e.target for e in candidates(model, ["position"], ["joint_friction"])]
     assert any("x" in target for target in asked)
-    assert any(e.name == "gravity_tilt" for e in candidates(model, ["position"]))
+    found = {(e.name, e.target) for e in candidates(model, ["position"])}
+    expected = ("sliding_friction", "rolling_friction", "adhesion", "air_drag", "size", "mass")
+    assert {(name, ("roller",)) for name in expected} <= found
 
 
 @pytest.mark.parametrize(
@@ -51,7 +58,10 @@ def test_joints_of_a_body_in_a_plane_only_place_it() -> None:
         ('limited="true" range="-1 1"', ""),
         ("", DRIVE),
         ("", BELT),
+        ("", COUPLING),
+        ('armature="0.1"', ""),
     ],
 )
 def test_joints_with_a_drive_or_a_resistance_are_bearings(of_turn: str, more: str) -> None:
-    assert placing_joints(mujoco.MjModel.from_xml_string(plane(of_turn, more))) == set()
+    m = mujoco.MjModel.from_xml_string(plane(of_turn, more))
+    assert placing_joints(m) == unguided_bodies(m) == []

@@ -203,6 +203,7 @@ def fitted(errors: np.ndarray, **changes: Any) -> Any:
     rarity = changes.pop("rarity", 0.0)
     effect = SimpleNamespace(
         rarity=rarity,
+        kind="sensor",
         has_as_special_case=lambda _: False,
         name="mass",
         target=("x",),
@@ -224,7 +225,7 @@ def fitted(errors: np.ndarray, **changes: Any) -> Any:
 
 
 def test_a_size_is_no_surprise_below_what_is_typical():
-    effect: Any = SimpleNamespace(rarity=0.0)
+    effect: Any = SimpleNamespace(rarity=0.0, kind="joint")
     for typical, unit in ((0.0, 0.3), (0.1, 0.3), (2.0, 2.0)):
         sizes = [Parameter("a", "-", 1.0, 0.0, 9.0, 0.3, typical=typical)]
         assert surprise(effect, sizes, [1.0], 1) == 0
@@ -235,7 +236,9 @@ def test_a_size_is_no_surprise_below_what_is_typical():
     other = Parameter("b[0]", "-", 0.0, 0.0, 9.0, 1.0)
     assert surprise(effect, joints, [1.0, -2.0, 0.0, 1.0], 1) == pytest.approx(2 * np.log(5))
     assert surprise(effect, [*joints, other], [1.0, -2.0, 0.0, 1.0, 1.0], 1) == pytest.approx(2 * np.log(5 * 2))
-    rare: Any = SimpleNamespace(rarity=6.0)
+    sensors: Any = SimpleNamespace(rarity=0.0, kind="sensor")
+    assert surprise(sensors, joints, [1.0, -2.0, 0.0, 1.0], 1) == pytest.approx(2 * np.log(2 * 5 * 2))
+    rare: Any = SimpleNamespace(rarity=6.0, kind="joint")
     assert surprise(rare, [Parameter("a", "-", np.inf, 0.0, 9.0, 0.3)], [5.0], 1) == 6
 
 

@@ -42,6 +42,19 @@ def test_a_window_is_rough_where_no_step_attains_what_is_foretold() -> None:
     assert with_rough_windows(made([0.5] * 3)[0], replace(fit, rough=(0, 2))).rough == ()
 
 
+def test_a_window_that_is_as_foretold_for_a_short_step_alone_is_not_rough() -> None:
+    solver, fit = made([1.0, 1.0, 1.0])
+    full = start_steps(fit)[0] * SPREAD
+    simulated = solver.p.residuals
+
+    def only_near(trials: list[Any]) -> list[np.ndarray]:
+        near = [np.linalg.norm(t.offset / SPREAD) < 0.2 * np.linalg.norm(full / SPREAD) for t in trials]
+        return [r if ok else fit.linear[0].residual for r, ok in zip(simulated(trials), near, strict=True)]
+
+    solver.p.residuals = only_near
+    assert with_rough_windows(solver, fit).rough == ()
+
+
 def test_residuals_of_rough_windows_are_as_they_are() -> None:
     _, fit = made([1.0] * 3)
     smooth, rough = projected(fit), projected(replace(fit, rough=(1,)))
