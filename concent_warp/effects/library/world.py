@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.joints import MUJOCO
-from concent_warp.effects.select import unguided_body_targets
+from concent_warp.effects.select import element_name, free_bodies, unguided_body_targets
 from concent_warp.scene.spheres.contact_geometry import SPHERE_GEOM_GROUP as SPHERES
 
 AIR_DENSITY = 1.2
@@ -136,6 +136,12 @@ class Wind(AirEffect):
     signature = "a residual force along one direction on light bodies in flight"
     confusions = ("gravity_tilt", "air_drag")
     rarity = 6.0
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all free bodies together: what moves in a plane rolls or slides there, hardly moved by wind."""
+        found = tuple(n for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return (found,) if found else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Velocity of the wind along each axis of the world."""

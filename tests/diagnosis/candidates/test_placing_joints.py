@@ -47,6 +47,7 @@ def test_joints_of_a_body_in_a_plane_only_place_it() -> None:
     found = {(e.name, e.target) for e in candidates(model, ["position"])}
     expected = ("sliding_friction", "rolling_friction", "adhesion", "air_drag", "size", "mass")
     assert {(name, ("roller",)) for name in expected} <= found
+    assert not any(name == "wind" for name, _ in found)
 
 
 @pytest.mark.parametrize(
