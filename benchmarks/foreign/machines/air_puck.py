@@ -71,7 +71,7 @@ class Values(NamedTuple):
     slope_x: float = 0.0
     """Horizontal part of gravity along x, as a share of it."""
     slope_y: float = 0.0
-    rubbing: float = 0.0
+    strip_friction: float = 0.0
     """Coefficient of friction where no air comes out of the table."""
 
 
@@ -81,7 +81,7 @@ VARIED = ("mass", "inertia", "film", "film_turn", "grip", "stiffness", "damping"
 @njit(cache=True)
 def derivative(t: float, y: np.ndarray, u: np.ndarray, p: Values, dy: np.ndarray) -> None:  # noqa: ARG001
     """Newton's law of the puck; the state is place, heading and their speeds."""
-    dry = p.rubbing * 9.81 * p.mass if BLOCKED[0] < y[0] < BLOCKED[1] else 0.0
+    dry = p.strip_friction * 9.81 * p.mass if BLOCKED[0] < y[0] < BLOCKED[1] else 0.0
     drag = p.film + dry / np.sqrt(y[3] ** 2 + y[4] ** 2 + 1e-6)
     ax = 9.81 * p.slope_x - drag * y[3] / p.mass
     ay = 9.81 * p.slope_y - drag * y[4] / p.mass
@@ -138,7 +138,7 @@ CASES = cases(
         Cause("not_level", "single", (("gravity_tilt",),), values={"slope_x": 0.004, "slope_y": -0.0025}),
         Cause("dead_cushions", "single", (("contact_compliance",),), {"damping": 1.8}, noise_stated=True),
         Cause("weighted_rim", "single", (("inertia", "armature"),), {"inertia": 1.6}, noise_stated=True),
-        Cause("blocked_holes", "outside", values={"rubbing": 0.015}),
+        Cause("blocked_holes", "outside", values={"strip_friction": 0.015}),
     ),
     record,
 )

@@ -678,23 +678,26 @@ def projected(fit: Fit, cfg: RobustLossCfg | None = None) -> list[Linear]:
     """
     found = []
     for w, (window, a, o) in enumerate(zip(fit.linear, fit.starts, fit.offsets, strict=True)):
-        near = cauchy_weight(o, cfg)
-        m = a.T @ a + np.diag(near)
+        m, _ = _start_normal(a, o, cfg)
         jacobian, whole = window.jacobian - a @ np.linalg.solve(m, a.T @ window.jacobian), window.jacobian
         left = np.linalg.norm(jacobian, axis=0)
         determined = left > LEAST_SHARE * np.linalg.norm(whole, axis=0)
         determined |= left > LEAST_CHANGE * np.sqrt(len(jacobian))
         residual = window.residual
         if w not in fit.rough:
-            residual = residual - a @ np.linalg.solve(m, a.T @ residual + near * o)
+            residual = residual + a @ foretold_start_step(fit, w, cfg)
         found.append(replace(window, jacobian=jacobian * determined, residual=residual))
     return found
 
 
-def start_steps(fit: Fit, cfg: RobustLossCfg | None = None) -> list[np.ndarray]:
-    """Return the steps of the initial states that `projected` residuals foretell, in units of their spread."""
-    found = []
-    for window, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
-        near = cauchy_weight(o, cfg)
-        found.append(-np.linalg.solve(a.T @ a + np.diag(near), a.T @ window.residual + near * o))
-    return found
+def foretold_start_step(fit: Fit, window: int, cfg: RobustLossCfg | None = None) -> np.ndarray:
+    """Return the step of a window's initial state, in units of its spread, that its `projected` residuals foretell."""
+    a, o = fit.starts[window], fit.offsets[window]
+    m, near = _start_normal(a, o, cfg)
+    return -np.linalg.solve(m, a.T @ fit.linear[window].residual + near * o)
+
+
+def _start_normal(a: np.ndarray, o: np.ndarray, cfg: RobustLossCfg | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal matrix of a window's initial state with its prior, and the weights of that prior."""
+    near = cauchy_weight(o, cfg)
+    return a.T @ a + np.diag(near), near

@@ -6,12 +6,11 @@ those of the jumps then, and a linear step along them seems to explain what no i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.fit.effects.least_squares import Fit, Solver, projected, start_steps
+from concent_warp.fit.effects.least_squares import Fit, Solver, foretold_start_step, projected
 from concent_warp.fit.effects.prediction import SimulationRequest
 
 
@@ -29,7 +28,8 @@ def with_rough_windows(solver: Solver, fit: Fit) -> Fit:
     doubted = _doubted(solver, fit)
     if not doubted:
         return replace(fit, rough=())
-    steps, lengths = start_steps(fit, solver.cfg.robust), solver.cfg.doubted_step_lengths
+    lengths = solver.cfg.doubted_step_lengths
+    steps = {w: foretold_start_step(fit, w, solver.cfg.robust) for w in doubted}
     trials = [
         SimulationRequest(w, fit.values, (fit.offsets[w] + length * steps[w]) * solver.p.windows[w].spread)
         for w in doubted
@@ -58,6 +58,6 @@ def _doubted(solver: Solver, fit: Fit) -> dict[int, float]:
     return found
 
 
-def _square(residual: Sequence[float] | np.ndarray) -> float:
+def _square(residual: np.ndarray) -> float:
     """Return the sum of squares."""
     return float(np.dot(residual, residual))
