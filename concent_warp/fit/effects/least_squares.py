@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from concent_warp.checks import Count, Factor, Positive, Share
-from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch, start_cost
+from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch, start_cost, start_step
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
 
@@ -678,26 +678,13 @@ def projected(fit: Fit, cfg: RobustLossCfg | None = None) -> list[Linear]:
     """
     found = []
     for w, (window, a, o) in enumerate(zip(fit.linear, fit.starts, fit.offsets, strict=True)):
-        m, _ = _start_normal(a, o, cfg)
+        m = a.T @ a + np.diag(cauchy_weight(o, cfg))
         jacobian, whole = window.jacobian - a @ np.linalg.solve(m, a.T @ window.jacobian), window.jacobian
         left = np.linalg.norm(jacobian, axis=0)
         determined = left > LEAST_SHARE * np.linalg.norm(whole, axis=0)
         determined |= left > LEAST_CHANGE * np.sqrt(len(jacobian))
         residual = window.residual
         if w not in fit.rough:
-            residual = residual + a @ foretold_start_step(fit, w, cfg)
+            residual = residual + a @ start_step(residual, a, o, np.inf, 0.0, cfg)
         found.append(replace(window, jacobian=jacobian * determined, residual=residual))
     return found
-
-
-def foretold_start_step(fit: Fit, window: int, cfg: RobustLossCfg | None = None) -> np.ndarray:
-    """Return the step of a window's initial state, in units of its spread, that its `projected` residuals foretell."""
-    a, o = fit.starts[window], fit.offsets[window]
-    m, near = _start_normal(a, o, cfg)
-    return -np.linalg.solve(m, a.T @ fit.linear[window].residual + near * o)
-
-
-def _start_normal(a: np.ndarray, o: np.ndarray, cfg: RobustLossCfg | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normal matrix of a window's initial state with its prior, and the weights of that prior."""
-    near = cauchy_weight(o, cfg)
-    return a.T @ a + np.diag(near), near

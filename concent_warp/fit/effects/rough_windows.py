@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.fit.effects.least_squares import Fit, Solver, foretold_start_step, projected
+from concent_warp.fit.effects.initial_states import start_step
+from concent_warp.fit.effects.least_squares import Fit, Solver, projected
 from concent_warp.fit.effects.prediction import SimulationRequest
 
 
@@ -29,7 +30,10 @@ def with_rough_windows(solver: Solver, fit: Fit) -> Fit:
     if not doubted:
         return replace(fit, rough=())
     lengths = solver.cfg.doubted_step_lengths
-    steps = {w: foretold_start_step(fit, w, solver.cfg.robust) for w in doubted}
+    steps = {
+        w: start_step(fit.linear[w].residual, fit.starts[w], fit.offsets[w], np.inf, 0.0, solver.cfg.robust)
+        for w in doubted
+    }
     trials = [
         SimulationRequest(w, fit.values, (fit.offsets[w] + length * steps[w]) * solver.p.windows[w].spread)
         for w in doubted

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear, foretold_start_step, projected
+from concent_warp.fit.effects.initial_states import start_step
+from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear, projected
 from concent_warp.fit.effects.rough_windows import with_rough_windows
 
 ROWS = 60
@@ -44,7 +45,7 @@ def test_a_window_is_rough_where_no_step_attains_what_is_foretold() -> None:
 
 def test_a_window_that_is_as_foretold_for_a_short_step_alone_is_not_rough() -> None:
     solver, fit = made([1.0, 1.0, 1.0])
-    full = foretold_start_step(fit, 0) * SPREAD
+    full = start_step(fit.linear[0].residual, STARTS[0], fit.offsets[0], np.inf, 0.0) * SPREAD
     simulated = solver.p.residuals
 
     def only_near(trials: list[Any]) -> list[np.ndarray]:
@@ -62,7 +63,7 @@ def test_residuals_of_rough_windows_are_as_they_are() -> None:
         np.testing.assert_array_equal(smooth[w].jacobian, rough[w].jacobian)
         expected = fit.linear[w].residual if w == 1 else smooth[w].residual
         np.testing.assert_array_equal(rough[w].residual, expected)
-        step = foretold_start_step(fit, w)
+        step = start_step(fit.linear[w].residual, STARTS[w], fit.offsets[w], np.inf, 0.0)
         assert step == pytest.approx(-OFF, abs=0.5)
         assert smooth[w].residual == pytest.approx(fit.linear[w].residual + STARTS[w] @ step)
 
