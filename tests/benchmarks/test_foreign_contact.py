@@ -8,22 +8,23 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.foreign import integrate as accurate
 from benchmarks.foreign.contact import GRAVITY, Slab, integrate
+from benchmarks.foreign.jointed import Hidden
 from benchmarks.foreign.machines import (
     air_puck,
     ball_beam,
     bowling_ball,
+    disc_push,
     door_push,
     gripper_lift,
     off_centre_push,
+    press,
     push_box,
     tossed_block,
     vee_roller,
 )
 from benchmarks.foreign.readings import Command, command_times, conjugate, turned
-
-STEPS = 1000
-"""Steps of the models per second."""
 
 
 def stopping_distance():
@@ -50,6 +51,26 @@ def turn_of_a_spinning_ball():
     return angle, lane.inertia * 12.0**2 / 2 / (lane.torsion * lane.mass * GRAVITY)
 
 
+def turn_of_a_spinning_disc():
+    """Return the angle at which a disc that spins on its rim stops, and its energy by the torque of friction."""
+    p = disc_push.Values()
+    far = accurate.Held(np.zeros(1), np.zeros(1))
+    start = np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 12.0])
+    time = np.array([0.0, 1.0])
+    state = accurate.integrate(disc_push.derivative, p, start, (far, far), (0.0, 0.0), time, 0.0)
+    torque = p.friction * p.mass * GRAVITY * disc_push.RADIUS
+    return state[-1, 6], p.inertia * 12.0**2 / 2 / torque
+
+
+def force_of_a_held_press():
+    """Return what the force cell reads while a pad is held pressed, and the pad's force less the foot's weight."""
+    p = press.Values()
+    machine = press.MACHINE
+    motion = machine.motions(np.random.default_rng(0))[0]
+    seen = machine.readings(motion, p, Hidden(), {s.name: np.array([3.6]) for s in machine.sensors})
+    return seen["force_cell"][0, 2], p.pad * seen["gauge"][0, 0] + p.foot * GRAVITY
+
+
 def work_of_friction_on_a_slab():
     """Return the energy that a box loses while it slides and turns, and the work of friction on it."""
     slab, mass, moment = Slab(0.05, 0.03, 0.02), 0.4, 5e-4
@@ -70,6 +91,8 @@ def work_of_friction_on_a_slab():
         (stopping_distance, 0.01),
         (speed_of_rolling, 1e-3),
         (turn_of_a_spinning_ball, 0.01),
+        (turn_of_a_spinning_disc, 0.01),
+        (force_of_a_held_press, 1e-3),
         (work_of_friction_on_a_slab, 1e-3),
     ],
 )
@@ -96,8 +119,8 @@ def replayed(model, commands, duration, read, start=None):
     if start is not None:
         start(d)
     rows = []
-    for k in range(round(duration * STEPS)):
-        d.ctrl[:] = [command(k / STEPS) for command in commands]
+    for k in range(round(duration / m.opt.timestep)):
+        d.ctrl[:] = [command(k * m.opt.timestep) for command in commands]
         mujoco.mj_step(m, d)
         rows.append(read(d))
     return np.array(rows)
@@ -175,6 +198,35 @@ def vee_roller_case():
     return simulated, state[1:, :2]
 
 
+def disc_push_case():
+    stands, strokes = disc_push.RUNS[1]
+    commands = disc_push.set_points(strokes)
+    _, state = disc_push.push(disc_push.Values(), stands, commands)
+
+    def place(d):
+        d.qpos[2:4] = stands[:2]
+        d.qpos[5:9] = [np.cos(stands[2] / 2), 0.0, 0.0, np.sin(stands[2] / 2)]
+
+    told = [Command(c.time, c.value) for c in commands]
+    simulated = replayed(disc_push.MODEL, told, disc_push.DURATION, lambda d: d.qpos[:4].copy(), place)
+    return simulated, state[1:, [0, 1, 4, 5]]
+
+
+def press_case():
+    p, machine = press.Values(), press.MACHINE
+    motion = machine.motions(np.random.default_rng(0))[1]
+    held = motion.commands["screw"]
+    time = np.arange(1, round(motion.duration / 5e-4) + 1) * 5e-4
+    seen = machine.readings(motion, p, Hidden(), dict.fromkeys(("scale", "gauge", "force_cell"), time))
+
+    def lower(d):
+        d.qpos[1] = press.rest(p, held.value)[1]
+
+    command = Command(held.time, held.value)
+    simulated = replayed(press.MODEL, [command], motion.duration, lambda d: d.qpos[[1, 0]].copy(), lower)
+    return simulated, np.concatenate([seen["scale"], seen["gauge"]], axis=1)
+
+
 @pytest.mark.parametrize(
     ("case", "tolerance"),
     [
@@ -185,6 +237,8 @@ def vee_roller_case():
         (air_puck_case, 5e-3),
         (off_centre_push_case, 3e-3),
         (vee_roller_case, 3e-3),
+        (disc_push_case, 1e-3),
+        (press_case, 2e-5),
     ],
 )
 def test_equations_with_nominal_values_agree_with_mujoco(case, tolerance):
