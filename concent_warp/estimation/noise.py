@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Source = Literal["stated", "rest", "differences", "resolution", "points", "unknown"]
 """Where a noise figure is from."""
 WORDS: dict[Source, str] = {
-    "stated": "stated in the recording",
+    "stated": "as stated",
     "rest": "estimated where nothing moves",
     "differences": "estimated from differences between samples",
     "resolution": "from the resolution of the readings",

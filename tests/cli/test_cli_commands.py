@@ -116,7 +116,7 @@ def test_compare_names_the_worst_places(bench, capsys):
 def test_compare_takes_the_scene_of_the_recording_by_default(bench, capsys):
     assert main(["compare", str(bench / "demo.h5")]) == 0
     out = capsys.readouterr().out
-    assert "noise: stated in the recording" in out
+    assert "noise: as stated" in out
     assert "Nowhere above 3 x noise." in out
 
 

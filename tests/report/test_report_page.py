@@ -201,7 +201,7 @@ def test_a_model_as_good_as_the_noise_is_reported_to_be_so(tmp_path):
     text = (tmp_path / "r.html").read_text()
     assert "at the level of the measurement noise (" in text
     assert "The error is nowhere above 3 x noise" in text
-    assert "Noise: stated in the recording." in text
+    assert "Noise: as stated." in text
     assert embedded(tmp_path / "r.html")["places"] == []
 
 
