@@ -21,8 +21,10 @@ from benchmarks.foreign.machines import (
     off_centre_push,
     press,
     push_box,
+    squat_leg,
     tossed_block,
     vee_roller,
+    wiper,
 )
 from benchmarks.foreign.readings import Command, command_times, conjugate, turned
 
@@ -244,6 +246,41 @@ def press_case():
 def test_equations_with_nominal_values_agree_with_mujoco(case, tolerance):
     simulated, written = case()
     assert np.sqrt(np.mean((simulated - written) ** 2, axis=0)).max() < tolerance
+
+
+@pytest.mark.parametrize(("machine", "motion"), [(squat_leg.MACHINE, 0), (squat_leg.MACHINE, 3), (wiper.MACHINE, 0)])
+def test_readings_of_a_leg_and_a_wiper_agree_with_mujoco_to_a_fiftieth_of_their_range(machine, motion):
+    run = machine.motions(np.random.default_rng(3))[motion]
+    stamps = {s.name: np.arange(round(run.duration * STEPS)) / STEPS for s in machine.sensors}
+    expected = np.hstack(list(machine.readings(run, machine.nominal, Hidden(), stamps).values()))
+    m = mujoco.MjModel.from_xml_string(machine.model)
+    d = mujoco.MjData(m)
+    d.qpos[:] = expected[0, : m.nq]
+    found = np.empty_like(expected)
+    for k in range(-STEPS, len(found)):  # the first commands act for a second before the motion, as in the log
+        now = max(k, 0) / STEPS + 1e-9
+        for name, held in run.commands.items():
+            d.ctrl[m.actuator(name).id] = held.value[np.searchsorted(held.time, now, side="right") - 1]
+        mujoco.mj_step(m, d)
+        if k >= 0:
+            found[k] = d.sensordata  # of the beginning of the step
+    assert np.all(np.sqrt(np.mean((found - expected) ** 2, axis=0)) < 0.02 * np.ptp(expected, axis=0))
+
+
+def test_a_leg_in_the_air_has_the_acceleration_of_the_model_in_the_log():
+    m = mujoco.MjModel.from_xml_string(squat_leg.MODEL)
+    m.dof_frictionloss[:] = 0
+    d = mujoco.MjData(m)
+    rng = np.random.default_rng(0)
+    p = squat_leg.Values(friction0=0.0, friction1=0.0, friction2=0.0)
+    for _ in range(5):
+        d.qpos[:] = rng.uniform([0.1, -1.0, -2.0], [0.5, 1.0, 0.0])
+        d.qvel[:], d.ctrl[:] = rng.uniform(-3, 3, 3), rng.uniform([-1, -2], [1, 0])
+        mujoco.mj_forward(m, d)
+        rate = np.empty(7)
+        squat_leg.derivative(0.0, np.concatenate([d.qpos, d.qvel, [0.0]]), d.ctrl.copy(), p, rate)
+        assert d.ncon == 0
+        np.testing.assert_allclose(rate[3:6], d.qacc, rtol=1e-9)
 
 
 def test_a_case_is_the_same_whenever_it_is_made():
