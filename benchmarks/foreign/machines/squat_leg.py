@@ -1,4 +1,13 @@
-"""A leg of two links whose hip rides on a vertical rail: squats, scuffs, hops and stamps on a rubber foot."""
+"""A leg of two links whose hip rides on a vertical rail: squats, scuffs, hops and stamps on a rubber foot.
+
+The constants of the contact in the model are those of a laboratory that tuned them to how far the foot sinks in and how
+little it creeps. Names that count:
+
+- The battery at the hip falls with the leg, so that hops show its weight and its inertia: it is mass,
+  and no preload of the rail.
+- The mat is softer under every load; a smaller foot would sit lower by one length in all of them.
+- The cord pulls below one height alone, which no spring on the rail does, since that acts in hops, too.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +24,7 @@ from benchmarks.foreign.log import Case
 MODEL = """
 <mujoco model="leg on a rail">
   <compiler angle="radian"/>
-  <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="10"/>
+  <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="50"/>
   <default>
     <geom type="capsule" size="0.018" contype="0" conaffinity="0"/>
     <joint type="hinge" axis="0 -1 0"/>
@@ -35,7 +44,7 @@ MODEL = """
           <joint name="knee" armature="0.009" damping="0.05" frictionloss="0.12"/>
           <geom fromto="0 0 0 0 0 -0.2" size="0.012"/>
           <geom name="foot" type="sphere" size="0.02" pos="0 0 -0.2" contype="1" conaffinity="1" friction="0.6"
-            solref="0.01 1"/>
+            solref="0.005 0.5" solimp="0.6 0.6 0.001"/>
         </body>
       </body>
     </body>
@@ -204,7 +213,7 @@ MACHINE = Machine(
 CASES: tuple[Case, ...] = (
     MACHINE.case("null", "null", habits=Habits(stated=True)),
     MACHINE.case("dusty_floor", "single", (("sliding_friction",),), Hidden(factors={"grip": 0.6}), Habits(stated=True)),
-    MACHINE.case("foam_mat", "single", (("contact_compliance",),), Hidden(factors={"ground": 0.2})),
+    MACHINE.case("foam_mat", "single", (("contact_compliance",),), Hidden(factors={"ground": 0.35})),
     MACHINE.case("dry_rail", "single", (("joint_friction",),), Hidden(added={"friction0": 5.0}), Habits(lost=0.01)),
     MACHINE.case("battery", "single", (("mass",),), Hidden(added={"mass0": 0.5}), Habits(stated=True)),
     MACHINE.case("safety_cord", "outside", (), Hidden(added={"cord": 450.0}), Habits(lost=0.01)),

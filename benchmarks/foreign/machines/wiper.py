@@ -1,4 +1,9 @@
-"""An arm that turns about an upright axis presses a pad on a spring on a table and wipes; a force cell at the wrist."""
+"""An arm that turns about an upright axis presses a pad on a spring on a table and wipes; a force cell at the wrist.
+
+Names that count: the spring's travel is read, so that a weak spring is not taken for a soft pad or table; the motor of
+the yaw has play to the arm, whose encoder is at the arm; the cell reads all forces too large, in proportion.
+The table slopes along the way of the pad, a length that no shape of the pad, which is round, stands for.
+"""
 
 from __future__ import annotations
 
@@ -66,8 +71,8 @@ CURRENT_LOOP = 2e-4
 class Values(NamedTuple):
     """Values of the wiper; the pad moves down against the ram where the spring is stretched."""
 
-    arm: float = 0.016 + 1.4 * 0.12**2
-    """Moment of the arm about its axis [kg m^2]."""
+    arm: float = 0.016 + 1.4 * 0.12**2 + 0.0003 + 0.00008 + 0.00003
+    """Moment of the arm about its axis, with those of what it carries about their own [kg m^2]."""
     rotor: float = 0.05
     ram: float = 0.6
     screw: float = 1.5
@@ -100,12 +105,14 @@ class Values(NamedTuple):
 
 @njit(cache=True)
 def gear_torque(twist: float, rate: float, p: Values) -> float:
-    """Return the torque of the gear on the arm [N m]: none within the play, and a push alone at each end of it."""
+    """Return the torque of the gear on the arm [N m]; where it has play, none within the play, and a push alone at each end of it."""
+    if p.play == 0.0:
+        return p.gear * twist + p.gear_damping * rate
     if twist > 0.5 * p.play:
         return max(0.0, p.gear * (twist - 0.5 * p.play) + p.gear_damping * rate)
     if twist < -0.5 * p.play:
         return min(0.0, p.gear * (twist + 0.5 * p.play) + p.gear_damping * rate)
-    return p.gear_damping * rate if p.play == 0.0 else 0.0
+    return 0.0
 
 
 @njit(cache=True)
