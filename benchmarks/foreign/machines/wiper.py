@@ -105,7 +105,7 @@ class Values(NamedTuple):
 
 @njit(cache=True)
 def gear_torque(twist: float, rate: float, p: Values) -> float:
-    """Return the torque of the gear on the arm [N m]; where it has play, none within the play, and a push alone at each end of it."""
+    """Return the torque of the gear on the arm [N m]; one with play pushes at the ends of it alone."""
     if p.play == 0.0:
         return p.gear * twist + p.gear_damping * rate
     if twist > 0.5 * p.play:
