@@ -33,6 +33,16 @@ def stop_at(when: float | None) -> Iterator[None]:
         _deadline.reset(token)
 
 
+@contextmanager
+def unlimited() -> Iterator[None]:
+    """Let simulations within take as long as they do: few, of which what is found already has need."""
+    token = _deadline.set(None)
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
+
+
 def time_check() -> Callable[[], None]:
     """Return a function for this and other threads that raises an error once the deadline is over.
 

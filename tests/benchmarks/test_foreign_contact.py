@@ -250,15 +250,16 @@ def test_equations_with_nominal_values_agree_with_mujoco(case, tolerance):
 
 @pytest.mark.parametrize(("machine", "motion"), [(squat_leg.MACHINE, 0), (squat_leg.MACHINE, 3), (wiper.MACHINE, 0)])
 def test_readings_of_a_leg_and_a_wiper_agree_with_mujoco_to_a_fiftieth_of_their_range(machine, motion):
-    run = machine.motions(np.random.default_rng(3))[motion]
-    stamps = {s.name: np.arange(round(run.duration * STEPS)) / STEPS for s in machine.sensors}
-    expected = np.hstack(list(machine.readings(run, machine.nominal, Hidden(), stamps).values()))
     m = mujoco.MjModel.from_xml_string(machine.model)
+    steps = round(1 / m.opt.timestep)  # in a second
+    run = machine.motions(np.random.default_rng(3))[motion]
+    stamps = {s.name: np.arange(round(run.duration * steps)) / steps for s in machine.sensors}
+    expected = np.hstack(list(machine.readings(run, machine.nominal, Hidden(), stamps).values()))
     d = mujoco.MjData(m)
     d.qpos[:] = expected[0, : m.nq]
     found = np.empty_like(expected)
-    for k in range(-STEPS, len(found)):  # the first commands act for a second before the motion, as in the log
-        now = max(k, 0) / STEPS + 1e-9
+    for k in range(-steps, len(found)):  # the first commands act for a second before the motion, as in the log
+        now = max(k, 0) / steps + 1e-9
         for name, held in run.commands.items():
             d.ctrl[m.actuator(name).id] = held.value[np.searchsorted(held.time, now, side="right") - 1]
         mujoco.mj_step(m, d)

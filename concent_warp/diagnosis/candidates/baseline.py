@@ -19,6 +19,7 @@ from concent_warp.fit.effects.robust import huber, huber_limit
 from concent_warp.fit.effects.rough_windows import with_rough_windows
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
+from concent_warp.simulate.time_limit import unlimited
 
 BOUND_DISTANCE = 1e-3
 """Distance from a bound up to which a parameter is at it, in units of its scale [-]; that of `FittedParameter`."""
@@ -94,9 +95,14 @@ def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> F
 def fitted_model(
     model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName, cfg: EffectSolverCfg
 ) -> FittedModel:
-    """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""
+    """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors.
+
+    The few simulations that this takes are made although the time may be over: the fit would be lost without them.
+    """
     settings = cfg.least_squares
-    fit = with_rough_windows(Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), settings), fit)
+    solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), settings)
+    with unlimited():
+        fit = with_rough_windows(solver, fit)
     pieces = tuple(without_bounded(model, projected(fit, settings.robust)))
     limit = huber_limit([piece.residual for piece in pieces], settings.robust)
     errors = held_out_errors(model, block_sums(pieces, blocks, limit), blocks, settings.prior)

@@ -26,6 +26,7 @@ from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_f
 from concent_warp.fit.effects.impacts import impacts
 from concent_warp.fit.effects.observation import TimeStepDefect, Window
 from concent_warp.fit.effects.robust import cauchy_weight
+from concent_warp.simulate.time_limit import unlimited
 
 
 def longer_time_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel:
@@ -141,7 +142,7 @@ def at_given_step(last: FittedModel, timestep: float, cfg: TimeStepCfg) -> Fitte
 
 
 def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
-    """Return what a shorter time step changes.
+    """Return what a shorter time step changes; simulations for it are made although the time may be over.
 
     Args:
         base: The fitted model with its own time step.
@@ -150,7 +151,8 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
     """
     gain = base.errors - errors_like(finer, base)
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
-    change = [a - b for a, b in zip(_residuals(finer), _residuals(base), strict=True)]
+    with unlimited():
+        change = [a - b for a, b in zip(_residuals(finer), _residuals(base), strict=True)]
     return FinerTimeStep(
         given=base.timestep,
         used=finer.timestep,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,14 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, Search
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cfg import EffectSolverCfg
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.observe import observe
+from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import huber, huber_limit
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.time_limit import stop_at
+from tests.scenes.bouncing import bounced
 
 ANY: Any = None
 SETTINGS = EffectSolverCfg()
@@ -53,6 +61,27 @@ def test_parameters_of_the_baseline_get_a_second_fit(monkeypatch, values, polish
     found: Any = fit_baseline("model", windows, ANY)  # pyright: ignore[reportArgumentType]
     assert found == ((f"model at {values}", "polished") if polished else ("model", "fit"))
     assert done == [("start", [[0, 0], [0, 0, 0, 0]]), (None, "o", "s")]
+
+
+def test_a_fit_that_was_found_as_the_time_ended_is_kept():
+    recording, _ = bounced(2, off=0.0)
+    model = Model(Scene(recording.scene))
+    windows = observe(model, recording)
+    blocks = cut_blocks(windows)
+    found = fit_baseline(model, windows, blocks)
+    far = replace(found.fit, linear=tuple(replace(w, residual=w.residual + 9.0) for w in found.fit.linear))
+    asked: list[int] = []
+
+    def simulated(self: Prediction, trials: Any) -> list[np.ndarray]:
+        asked.append(len(trials))
+        return residuals(self, trials)
+
+    with pytest.MonkeyPatch.context() as patch, stop_at(time.time() - 1):
+        residuals = Prediction.residuals
+        patch.setattr(Prediction, "residuals", simulated)
+        late = baseline.fitted_model(model, windows, blocks, far, found.engine, found.cfg)
+    assert asked  # derivatives that foretell much are tried
+    assert late.fit.cost == found.fit.cost
 
 
 @dataclass(frozen=True)

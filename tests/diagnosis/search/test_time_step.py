@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -31,6 +32,7 @@ from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
+from concent_warp.simulate.time_limit import stop_at
 from tests.scenes.bouncing import bounced
 from tests.scenes.swinging import DAMPING, TIMESTEP, swung
 
@@ -116,6 +118,8 @@ def test_a_step_that_is_too_long_is_shortened_until_it_explains_the_data(base, f
     assert told.gain == pytest.approx(1 - finer.errors.sum() / base.errors.sum())
     assert told.low <= told.gain <= told.high
     assert told.change > 5
+    with stop_at(time.time() - 1):
+        assert finding(base, finer, seed=0) == told  # what was found as the time ended is told nevertheless
 
 
 def test_a_step_that_is_short_enough_stays(base):
