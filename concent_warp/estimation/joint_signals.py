@@ -13,7 +13,7 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.closed_loops import ClosedLoopCfg, close_loops
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
-from concent_warp.estimation.marked_joints import marked_joints
+from concent_warp.estimation.marked_joints import KnownJoints, marked_joints
 from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sample_values_and_rates
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.recording.recording import Channel
@@ -109,7 +109,31 @@ def coupled_joints(
     measured: Sequence[MeasuredJoint],
     min_singular: float,
 ) -> CoupledJoints:
-    """Return the positions of all hinges and slides, from joint and tendon sensors and from the scene's equalities.
+    """Return the positions of all hinges and slides, see `determined_joints`.
+
+    Raises:
+        RecordingError: The measurements do not determine a joint.
+    """
+    found, loose = determined_joints(m, demonstration, smoother, measured, min_singular)
+    if loose.any():
+        joints = m.dof_jntid[found.dof[loose]]
+        raise RecordingError(
+            "a window cannot start where joints were not measured",
+            where=demonstration.name,
+            expected=f"readings of {[m.joint(int(j)).name for j in joints]}",
+            fix="record joint position sensors, or fit whole demonstrations",
+        )
+    return found
+
+
+def determined_joints(
+    m: mujoco.MjModel,
+    demonstration: Demonstration,
+    smoother: SmootherCfg,
+    measured: Sequence[MeasuredJoint],
+    min_singular: float,
+) -> tuple[CoupledJoints, np.ndarray]:
+    """Return the positions of hinges and slides, from sensors, the scene's equalities and poses of the bodies on them.
 
     Args:
         m: The compiled scene.
@@ -118,8 +142,8 @@ def coupled_joints(
         measured: The joints whose position a sensor measured.
         min_singular: Smallest singular value of equations that determine all joints.
 
-    Raises:
-        RecordingError: The measurements do not determine a joint.
+    Returns:
+        The joints, and which of them the measurements do not determine, shape (J,) bool.
     """
     joints = np.flatnonzero(np.isin(m.jnt_type, HINGE_OR_SLIDE))
     column = {int(joint): i for i, joint in enumerate(joints)}
@@ -156,14 +180,7 @@ def coupled_joints(
             readings.append(signal)
         found = joined()
         loose = _loose(found.coefficients, min_singular)
-    if loose.any():
-        raise RecordingError(
-            "a window cannot start where joints were not measured",
-            where=demonstration.name,
-            expected=f"readings of {[m.joint(int(j)).name for j in joints[loose]]}",
-            fix="record joint position sensors, or fit whole demonstrations",
-        )
-    return found
+    return found, loose
 
 
 def _loose(rows: np.ndarray, min_singular: float) -> np.ndarray:
@@ -212,7 +229,8 @@ def _told_by_poses(
         known: All joints, of which some are determined.
         loose: Those that are not, shape (J,) bool.
     """
-    told = marked_joints(m, demonstration, known.dof[loose], known.dof[~loose].tolist())
+    others = KnownJoints(known.dof[~loose], lambda time: known.estimate(time).value[:, ~loose])
+    told = marked_joints(m, demonstration, known.dof[loose], others)
     if told is None:
         return {}
     return _smoothed(smoother, *told, loose)

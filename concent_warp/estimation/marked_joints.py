@@ -2,14 +2,14 @@
 
 At each time the residuals of the positions and orientations that were read are brought down by Gauss and Newton's steps
 of these joints, from the solution at the time before. At the first time several starts are tried, since a hinge may
-stand anywhere.
+stand anywhere. Joints that have sensors of their own are where these say.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -51,6 +51,16 @@ class MarkedJointCfg:
 
 
 @dataclass(frozen=True)
+class KnownJoints:
+    """Joints that other sensors tell."""
+
+    dof: np.ndarray
+    """Their degrees of freedom, hinges and slides, shape (K,)."""
+    estimate: Callable[[np.ndarray], np.ndarray]
+    """Returns their positions [m or rad] at times (T,) [s], shape (T, K)."""
+
+
+@dataclass(frozen=True)
 class _Mark:
     """Readings of one frame at common times."""
 
@@ -65,7 +75,7 @@ def marked_joints(
     m: mujoco.MjModel,
     demonstration: Demonstration,
     dofs: np.ndarray,
-    known: Sequence[int] = (),
+    known: KnownJoints | None = None,
     cfg: MarkedJointCfg | None = None,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return times [s], shape (T,), and positions of joints at these, shape (T, U), from poses of bodies on them.
@@ -74,27 +84,33 @@ def marked_joints(
         m: The compiled scene.
         demonstration: What was measured.
         dofs: Degrees of freedom of the joints to be found, hinges and slides, shape (U,).
-        known: Degrees of freedom of the joints that other sensors tell; bodies on these say nothing here.
+        known: The joints that other sensors tell; without them bodies on any others say nothing here.
         cfg: Settings.
 
     Returns:
-        None where no pose depends on them, or those that were read do not determine them most of the time.
+        NaN for joints that no pose depends on; None where that holds for all, or where those that were read do not
+        determine the others most of the time.
     """
     cfg = cfg or MarkedJointCfg()
-    channels = _frames(m, demonstration, {int(dof) for dof in dofs}, {int(dof) for dof in known})
+    others = set() if known is None else {int(dof) for dof in known.dof}
+    channels = _frames(m, demonstration, {int(dof) for dof in dofs}, others)
     if not channels:
         return None
+    told = {int(m.jnt_dofadr[j]) for frame, _, _ in channels for j in joints_below(m, frame.body)}
+    mine = np.isin(dofs, list(told))
     time = max((c.time[np.isfinite(c.value).any(axis=1)] for _, _, c in channels), key=len)
     if len(time) < 2:
         return None
     rate = 1 / float(np.median(np.diff(time)))
     time = time[:: max(math.ceil(rate / cfg.max_rate - 1e-6), 1)]
     marks = [_Mark(frame, turn, _at(channel, time, turn, cfg)) for frame, turn, channel in channels]
-    solver, found = _Solver(m, marks, dofs, cfg), np.full((len(time), len(dofs)), np.nan)
+    if known is None:
+        known = KnownJoints(np.zeros(0, dtype=int), lambda at: np.zeros((len(at), 0)))
+    solver, found = _Solver(m, marks, dofs[mine], known, time, cfg), np.full((len(time), len(dofs)), np.nan)
     start: np.ndarray | None = None
     for k in range(len(time)):
-        found[k], start = solver.at(k, start)
-    seen = np.isfinite(found).all(axis=1)
+        found[k, mine], start = solver.at(k, start)
+    seen = np.isfinite(found[:, mine]).all(axis=1)
     return (time[seen], found[seen]) if seen.mean() >= cfg.min_share and seen.sum() > 1 else None
 
 
@@ -110,14 +126,14 @@ def joints_below(m: mujoco.MjModel, body: int) -> list[int]:
 def _frames(
     m: mujoco.MjModel, demonstration: Demonstration, dofs: set[int], known: set[int]
 ) -> list[tuple[SensorFrame, bool, Channel]]:
-    """Return the frames on bodies that these joints alone carry, whether it is their orientation, and the readings."""
+    """Return the frames on bodies that these joints and known ones alone carry, whether turns are read, and what."""
     found: list[tuple[SensorFrame, bool, Channel]] = []
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
         if row < 0 or int(m.sensor_type[row]) not in (PLACE, TURN) or (frame := sensor_frame(m, row)) is None:
             continue
         below = {int(m.jnt_dofadr[j]) for j in joints_below(m, frame.body)}
-        if below & dofs and not below & known and below <= dofs:
+        if below & dofs and below <= dofs | known:
             found.append((frame, int(m.sensor_type[row]) == TURN, channel))
     return found
 
@@ -145,15 +161,27 @@ def _at(channel: Channel, time: np.ndarray, turn: bool, cfg: MarkedJointCfg) -> 
 class _Solver:
     """Finds joints at one time after the other."""
 
-    def __init__(self, m: mujoco.MjModel, marks: Sequence[_Mark], dofs: np.ndarray, cfg: MarkedJointCfg) -> None:
-        """Take what was read."""
+    def __init__(
+        self,
+        m: mujoco.MjModel,
+        marks: Sequence[_Mark],
+        dofs: np.ndarray,
+        known: KnownJoints,
+        time: np.ndarray,
+        cfg: MarkedJointCfg,
+    ) -> None:
+        """Take what was read at times (T,) [s]."""
         self._m, self._d, self._marks, self._dofs, self._cfg = m, mujoco.MjData(m), marks, dofs, cfg
+        self._others, self._where = m.jnt_qposadr[m.dof_jntid[known.dof]], known.estimate(time)
         joints = m.dof_jntid[dofs]
         self._address = m.jnt_qposadr[joints]
         self._hinge = m.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_HINGE)
 
     def at(self, row: int, start: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the joints at a time, NaN where they are not determined, and from where the next time starts."""
+        if not np.isfinite(self._where[row]).all():
+            return np.full(len(self._dofs), np.nan), start
+        self._d.qpos[self._others] = self._where[row]
         if start is None:
             value, error, determined = min((self._solved(row, one) for one in self._starts()), key=lambda one: one[1])
             turns = np.round((value - self._m.qpos0[self._address]) / (2 * math.pi))

@@ -1,8 +1,9 @@
 """The state of a scene at one time where only a part of it was measured.
 
 Joints and free bodies are estimated from their own readings by local polynomials, positions of a body component by
-component, and of joints of which the velocity alone was read, that; what was not measured stands as the recording's
-initial state or the model's reference pose has it, at rest.
+component, and of joints of which the velocity alone was read, that; joints without a sensor follow from tendons,
+equalities and poses of the bodies on them, as far as these determine them. What was not measured stands as the
+recording's initial state or the model's reference pose has it, at rest.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.estimation.ball_signals import ball_signals
-from concent_warp.estimation.joint_signals import joint_rates, joint_signals
+from concent_warp.estimation.joint_signals import determined_joints, joint_rates, joint_signals
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.recording.recording import Channel
@@ -22,6 +23,10 @@ from concent_warp.simulate.replay import initial_state
 
 if TYPE_CHECKING:
     from concent_warp.recording.recording import Demonstration
+
+
+MIN_SINGULAR = 1e-6
+"""Smallest singular value of equations that determine joints, as of `StateEstimatorCfg`."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +55,16 @@ def partial_state(
     cfg, at = cfg or LocalPolynomialCfg(), np.array([time])
     qpos, qvel = initial_state(m, demonstration)
     measured = np.zeros(m.nv, dtype=bool)
-    for joint in joint_signals(m, demonstration, cfg):
+    joints = joint_signals(m, demonstration, cfg)
+    for joint in joints:
         found = joint.position.estimate(at)
         qpos[joint.qpos], qvel[joint.dof] = found.value[0, 0], found.rate[0, 0]
         measured[joint.dof] = True
+    coupled, loose = determined_joints(m, demonstration, cfg, joints, MIN_SINGULAR)
+    if len(others := np.flatnonzero(~loose & ~measured[coupled.dof])):
+        found = coupled.estimate(at)
+        qpos[coupled.qpos[others]], qvel[coupled.dof[others]] = found.value[0, others], found.rate[0, others]
+        measured[coupled.dof[others]] = True
     if demonstration.qvel is None or time > 0.0:
         for joint, rate in joint_rates(m, demonstration, cfg).items():
             qvel[m.jnt_dofadr[joint]] = rate.estimate(at).value[0, 0]

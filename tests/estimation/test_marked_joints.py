@@ -96,10 +96,14 @@ def test_windows_start_in_the_motion_within_their_spread():
 
 
 def test_one_marker_on_the_first_link_tells_nothing_of_the_second():
-    model, _, seen = swing()
+    model, states, seen = swing()
     with pytest.raises(RecordingError, match="joints were not measured"):
         StateEstimator.of(model, only(seen, "elbow"))
-    assert marked_joints(model.scene.model, only(seen, "elbow"), np.arange(2)) is None
+    told = marked_joints(model.scene.model, only(seen, "elbow"), np.arange(2))
+    assert told is not None
+    np.testing.assert_allclose(told[1][:, 0], states[:, 0], atol=0.02)
+    assert np.isnan(told[1][:, 1]).all()
+    assert marked_joints(model.scene.model, only(seen, "elbow"), np.array([1])) is None
 
 
 def test_a_joint_with_an_encoder_keeps_its_own_spread():
@@ -108,3 +112,49 @@ def test_a_joint_with_an_encoder_keeps_its_own_spread():
     spread = start_spread(m, {"angle": 1e-4, "tip": 1e-3})
     assert spread[0] == pytest.approx(3e-4)
     assert spread[1] == pytest.approx(3e-3 / 0.22)
+
+
+PUCK = """<mujoco><option timestep="0.001"/><worldbody><body name="puck"><joint name="x" type="slide" axis="1 0 0"/>
+<joint name="y" type="slide" axis="0 1 0"/><joint name="heading" axis="0 0 1"/><geom type="cylinder" size="0.05 0.01"
+contype="0" conaffinity="0"/><site name="dot" pos="0.04 0 0"/></body>
+<body name="gauge" pos="1 0 0"><joint name="unread"/><geom size="0.01" contype="0" conaffinity="0"/></body></worldbody>
+<sensor><framepos name="dot_position" objtype="site" objname="dot"/><jointpos name="heading" joint="heading"/>
+</sensor></mujoco>"""
+
+
+@pytest.mark.parametrize("all_read", [True, False])
+def test_a_marker_tells_the_joints_without_a_sensor_beside_one_that_has_its_own(all_read):
+    scene = PUCK if all_read is False else PUCK.replace('<joint name="unread"/>', "")
+    time, rng = np.arange(0, 1, 0.01), np.random.default_rng(0)
+    x, y, heading = 0.3 - 0.8 * time, 0.1 * np.sin(3 * time), 0.5 + 2 * time
+    dot = np.stack([x + 0.04 * np.cos(heading), y + 0.04 * np.sin(heading), np.full_like(x, np.nan)], axis=1)
+    dot += rng.normal(0, NOISE, dot.shape)
+    measured = {"dot_position": Channel(time, dot, NOISE), "heading": Channel(time, heading[:, None], 1e-4)}
+    seen = Demonstration("demo_0", measured=measured)
+    model = Model(Scene(scene))
+    (window,) = observe(model, Recording(scene, (seen,)), length=2.0)
+    at = float(window.start)
+    expected = [0.3 - 0.8 * at, 0.1 * np.sin(3 * at), 0.5 + 2 * at], [-0.8, 0.3 * np.cos(3 * at), 2.0]
+    assert window.qpos[:3] == pytest.approx(expected[0], abs=2e-3)
+    assert window.qvel[:3] == pytest.approx(expected[1], abs=0.1)
+    spread = window.spread.reshape(2, -1)
+    assert (np.abs(window.qvel[:2] - expected[1][:2]) < 4 * spread[1, :2]).all()
+    # What nothing tells is where the model has it, as uncertain as such joints are.
+    if not all_read:
+        assert window.qpos[3] == window.qvel[3] == 0.0
+        unmeasured = start_spread(model.scene.model, {}, measured=np.zeros(4, dtype=bool))
+        assert spread[:, 3] == pytest.approx(unmeasured.reshape(2, -1)[:, 3])
+
+
+def test_joints_that_no_pose_depends_on_leave_the_others_told():
+    time = np.arange(0, 0.5, 0.01)
+    dot = np.stack([0.5 * time + 0.04, 0 * time, 0 * time], axis=1)
+    seen = Demonstration("demo_0", measured={"dot_position": Channel(time, dot, NOISE)})
+    m = Model(
+        Scene(PUCK.replace('<joint name="heading" axis="0 0 1"/>', "").replace('joint="heading"', 'joint="x"'))
+    ).scene.model
+    told = marked_joints(m, seen, np.arange(3))
+    assert told is not None
+    at, value = told
+    np.testing.assert_allclose(value[:, 0], 0.5 * at, atol=1e-6)
+    assert np.isnan(value[:, 2]).all()
