@@ -69,6 +69,38 @@ def test_a_ball_that_rebounds_less_than_the_models_is_seen_by_its_height_alone()
     assert effect.name == "contact_compliance"
 
 
+PUCK = """
+<mujoco><option timestep="0.001" gravity="0 0 0"/><default><geom solref="0.04 0.15" friction="0"/></default><worldbody>
+  <geom type="plane" size="1 1 0.1" pos="-0.4 0 0" euler="0 90 0"/>
+  <geom type="plane" size="1 1 0.1" pos="0.4 0 0" euler="0 -90 0"/>
+  <body name="puck"><joint name="x" type="slide" axis="1 0 0" damping="0.001"/>
+    <joint name="y" type="slide" axis="0 1 0" damping="0.001"/><joint name="heading" axis="0 0 1"/>
+    <geom size="0.05" mass="0.1"/></body></worldbody>
+<sensor><framepos name="place" objtype="body" objname="puck"/><jointpos name="heading" joint="heading"/></sensor>
+</mujoco>"""
+"""A puck that glides between cushions; a camera reads its place, a gyroscope that is integrated its heading."""
+
+
+def test_cushions_from_which_a_puck_rebounds_less_than_the_models_are_seen_by_a_camera_alone():
+    m = mujoco.MjModel.from_xml_string(PUCK.replace('solref="0.04 0.15"', 'solref="0.04 0.3"'))
+    m.opt.timestep = 0.0005
+    d, rng, time, states = mujoco.MjData(m), np.random.default_rng(0), np.arange(0, 2.5, 1 / 50), []
+    d.qpos[:], d.qvel[:] = [-0.1, -0.06, 0.0], [0.6, 0.05, 0.3]
+    for _ in time:
+        states.append(d.qpos.copy())
+        for _ in range(40):
+            mujoco.mj_step(m, d)
+    seen = np.array(states)
+    height = np.full((len(time), 1), np.nan)
+    place = np.hstack([seen[:, :2] + rng.normal(0, 5e-4, (len(time), 2)), height])
+    heading = seen[:, 2:] + rng.normal(0, 5e-3, (len(time), 1))
+    channels = {"place": Channel(time, place, 5e-4), "heading": Channel(time, heading, 5e-3)}
+    found = diagnosed(PUCK, Demonstration("demo_0", measured=channels), "contact_compliance", "joint_friction", "wind")
+    assert found.verdict == "effect"
+    assert [f.name for f in found.accepted] == ["contact_compliance"]
+    assert found.ratio[-1] < 1.2
+
+
 def pressed(time_constant: float) -> Demonstration:
     """Return a finger that presses on the door and lets go of it, in contacts of a time constant [s]."""
     m = mujoco.MjModel.from_xml_string(DOOR.format(time=time_constant))

@@ -197,9 +197,24 @@ def keeps_close(
             scatter = np.sqrt((_rms(away[near:]) ** 2).mean(axis=0)) if rough else np.zeros(len(record))
         scatter = np.clip(np.nan_to_num(scatter), 0.0, cfg.max_scatter_noise)
         curved = np.maximum(curved, np.nan_to_num(bend / np.hypot(1.0, scatter), nan=np.inf))
-    wild = np.flatnonzero(curved > cfg.max_curvature)
-    reach = span if not len(wild) else float(record[wild[0]] * m.opt.timestep)
+    passing = 0 if rough or not _can_touch(m) else round(cfg.max_transient / (every * m.opt.timestep))
+    wild = _first_lasting(curved > cfg.max_curvature, passing)
+    reach = span if wild is None else float(record[wild] * m.opt.timestep)
     return float(np.clip(reach, cfg.min_length, span))
+
+
+def _first_lasting(wild: np.ndarray, most: int) -> int | None:
+    """Return where the first run of more than `most` true values begins, or one that lasts to the end; None for none.
+
+    Args:
+        wild: Shape (T,) bool.
+        most: Most values of a run that is passed over.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wild, [False]]).astype(int)))
+    for begin, end in edges.reshape(-1, 2):
+        if end - begin > most or end == len(wild):
+            return int(begin)
+    return None
 
 
 def _away(start: np.ndarray, end: np.ndarray, *, turns: bool) -> np.ndarray:

@@ -143,6 +143,32 @@ def test_differences_that_are_not_finite_end_a_window_and_none_is_longer_than_th
     assert len(engine.calls[0][1]) == 1
 
 
+@pytest.mark.parametrize(
+    ("lasts", "touch", "free", "expected"),
+    [(0.08, True, False, 1.4), (0.16, True, False, 0.4), (0.08, False, False, 0.4), (0.08, True, True, 0.4)],
+)
+def test_a_window_goes_on_after_a_rebound_that_one_start_has_earlier_than_its_opposite(
+    monkeypatch, lasts, touch, free, expected
+):
+    def rebounding(record: np.ndarray) -> np.ndarray:
+        data, time = diverging(0.005)(record), record * 0.005
+        data[1:, (time > 0.395) & (time < 0.395 + lasts), 0] += 0.1
+        return data
+
+    monkeypatch.setattr(observing, "_can_touch", lambda _: touch)
+    assert reach(Simulated(rebounding), monkeypatch, rebounds=free, angle=1e-3) == pytest.approx(expected)
+
+
+def test_a_window_ends_where_starts_differ_shortly_before_its_end(monkeypatch):
+    def late(record: np.ndarray) -> np.ndarray:
+        data = diverging(0.005)(record)
+        data[1:, record * 0.005 > 1.345, 0] += 0.1
+        return data
+
+    monkeypatch.setattr(observing, "_can_touch", lambda _: True)
+    assert reach(Simulated(late), monkeypatch, angle=1e-3) == pytest.approx(1.35)
+
+
 def test_records_are_every_step_where_steps_are_long(monkeypatch):
     engine = Simulated(diverging(0.02, angle=0.004))
     monkeypatch.setattr(observing, "make_engine", lambda *_: engine)
