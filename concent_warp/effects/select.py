@@ -18,6 +18,13 @@ POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
 PARALLEL = 1e-3
 """Part of an axis across others below which they are parallel [-]."""
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
+FORCES = (
+    *(int(SENSOR.mjSENS_FORCE), int(SENSOR.mjSENS_TORQUE), int(SENSOR.mjSENS_TOUCH)),
+    *(int(SENSOR.mjSENS_ACTUATORFRC), int(SENSOR.mjSENS_JOINTACTFRC)),
+)
+"""Cells of force and torque, and drives' currents."""
+INERTIAL = (int(SENSOR.mjSENS_GYRO), int(SENSOR.mjSENS_ACCELEROMETER), int(SENSOR.mjSENS_VELOCIMETER))
+"""What an inertial measurement unit reads."""
 
 
 def element_name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:

@@ -139,3 +139,40 @@ def test_a_frame_keeps_readings_that_are_no_orientation():
 def test_each_sensor_has_a_value_of_its_own(effect):
     with pytest.raises(ValueError, match="zip"):
         effect("encoder").measure(world(PENDULUM).compile(), truth, np.array([0.1, 0.2]))
+
+
+CELL = """<mujoco><worldbody><body name="arm"><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".02"
+fromto="0 0 0 .4 0 0" mass="1"/><body pos=".4 0 0"><site name="wrist"/><geom size=".05" mass="1"/></body></body>
+</worldbody><actuator><motor name="drive" joint="hinge"/></actuator><sensor><jointpos name="encoder" joint="hinge"/>
+<force name="cell" site="wrist"/><torque name="moments" site="wrist"/><actuatorfrc name="current" actuator="drive"/>
+<gyro name="gyro" site="wrist"/><framepos name="place" objtype="site" objname="wrist"/></sensor></mujoco>"""
+
+
+def test_zeros_gains_and_delays_of_force_cells_and_gyroscopes_are_candidates_of_their_own():
+    m = world(CELL).compile()
+    forces = ("cell", "moments", "current")
+    assert SensorBias.targets(m) == (("encoder",), forces, ("gyro",))
+    assert SensorGain.targets(m) == (("encoder",), forces, ("gyro",))
+    assert Latency.targets(m) == (("place",), ("encoder",), forces, ("gyro",))
+    assert TimeBase.targets(m) == (("place",), ("encoder",))
+    assert set(Latency.single_targets(m)) == {("cell", "moments"), ("current",)}
+
+
+def test_a_force_cell_has_a_zero_along_each_axis_in_proportion_to_the_weight():
+    m, effect = world(CELL).compile(), SensorBias("encoder", "cell", "moments", "current", "gyro")
+    found = effect.parameters(m)
+    assert [p.name for p in found[:4]] == ["bias[encoder]", "bias_x[cell]", "bias_y[cell]", "bias_z[cell]"]
+    assert [p.unit for p in found] == ["rad", *["N"] * 3, *["N m"] * 4, *["rad/s"] * 3]
+    assert found[1].scale == pytest.approx(0.02 * 2 * 9.81)
+    assert found[4].scale == found[7].scale == pytest.approx(0.002 * 2 * 9.81)
+    values = np.arange(11.0)
+    read = effect.measure(m, lambda s, t: np.zeros((len(t), m.sensor(s).dim[0])), values)
+    np.testing.assert_array_equal(read("cell", TIME), np.tile([1.0, 2.0, 3.0], (len(TIME), 1)))
+    np.testing.assert_array_equal(read("gyro", TIME)[0], [8.0, 9.0, 10.0])
+    assert not read("place", TIME).any()
+    qpos, _ = SensorBias("encoder", "cell").true_state(m, np.array([0.5]), np.zeros(1), values[1:5])
+    assert qpos == pytest.approx([-0.5])  # the force cell's zero says nothing about the joint
+    light = world(CELL.replace('mass="1"', 'mass="1e-3"')).compile()
+    assert SensorBias("cell").parameters(light)[0].scale == pytest.approx(0.1)
+    slide = world(CELL.replace('axis="0 1 0"', 'type="slide"')).compile()
+    assert SensorBias("current").parameters(slide)[0].unit == "N"

@@ -9,10 +9,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import PHASE_ERROR, Effect, Parameter, Reader
-from concent_warp.effects.select import JOINTS, POSES, sensors_by_type, shown_free_joint
+from concent_warp.effects.select import FORCES, INERTIAL, JOINTS, POSES, sensors_by_type, shown_free_joint
 
 SCALES = (-0.03, -0.01, 0.01, 0.03)
 """Errors of scales that are scanned [-]: an impact at another time or place is not in proportion to them."""
+WEIGHT_SHARE, LEVER = 0.02, 0.1
+"""Typical zero of a force cell over the weight of all bodies [-], and the lever by which that of a torque is so [m]."""
+MIN_WEIGHT = 5.0
+"""Weight that is taken for it at least [N]."""
+BIASES = {
+    int(mujoco.mjtSensor.mjSENS_GYRO): ("rad/s", 0.02),
+    int(mujoco.mjtSensor.mjSENS_ACCELEROMETER): ("m/s^2", 0.2),
+    int(mujoco.mjtSensor.mjSENS_VELOCIMETER): ("m/s", 0.01),
+}
+"""Units of inertial sensors and their typical zeros in these."""
 CALIBRATION = "calibration of instruments: reading = gain true + bias, at a clock of its own"
 
 
@@ -26,7 +36,12 @@ class MeasurementEffect(Effect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the poses of bodies, and the joints."""
-        return tuple(group for kinds in (POSES, JOINTS) if (group := sensors_by_type(m, kinds)))
+        return groups(m, POSES, JOINTS)
+
+
+def groups(m: mujoco.MjModel, *kinds: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
+    """Return the names of the sensors of each of some kinds, where there are any: an instrument each."""
+    return tuple(group for kind in kinds if (group := sensors_by_type(m, kind)))
 
 
 class TimeBase(MeasurementEffect):
@@ -60,6 +75,11 @@ class Latency(MeasurementEffect):
     confusions = ("actuator_delay", "time_base")
     step_error = PHASE_ERROR
     singles_last = True
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the poses of bodies, the joints, forces, and inertial measurements."""
+        return groups(m, POSES, JOINTS, FORCES, INERTIAL)
 
     @classmethod
     def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -185,36 +205,47 @@ class SensorBias(MeasurementEffect):
     """Readings off by a constant."""
 
     name = "sensor_bias"
-    summary = "A constant is added to the reading."
+    summary = "A constant is added to the reading, one along each axis of a vector."
     signature = "constant residual of one sensor, with no force to go with it"
     confusions = ("joint_offset", "gravity_compensation")
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return the joints' positions."""
-        group = sensors_by_type(m, JOINTS[:1])
-        return (group,) if group else ()
+        """Return the joints' positions, forces, and inertial measurements."""
+        return groups(m, JOINTS[:1], FORCES, INERTIAL)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """Return one constant for each sensor."""
-        return tuple(
-            Parameter(f"bias[{sensor}]", _unit_of_reading(m, sensor), 0.0, low=-0.5, high=0.5, scale=0.01)
-            for sensor in self.elements
-        )
+        """Return one constant for each sensor, along each of its axes."""
+        found: list[Parameter] = []
+        for sensor in self.elements:
+            unit, scale = _typical_bias(m, sensor)
+            axes = ["_x", "_y", "_z"] if _axes(m, sensor) == len("xyz") else [""]
+            names = [f"bias{axis}[{sensor}]" for axis in axes]
+            found += [Parameter(n, unit, 0.0, low=-50 * scale, high=50 * scale, scale=scale) for n in names]
+        return tuple(found)
 
     def true_state(
         self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Effect.true_state`."""
-        qpos = qpos.copy()
-        for place, _, bias in _shown_joints(m, self.target, values):
+        qpos, biases = qpos.copy(), self._by_sensor(m, values)
+        first = np.array([biases[sensor][0] for sensor in self.target])
+        for place, _, bias in _shown_joints(m, self.target, first):
             qpos[place] -= bias
         return qpos, qvel
 
-    def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
+    def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:
         """Add it."""
-        bias = dict(zip(self.target, values, strict=True))
-        return lambda sensor, time: read(sensor, time) + bias.get(sensor, 0.0)
+        biases = self._by_sensor(m, values)
+        return lambda sensor, time: read(sensor, time) + biases.get(sensor, 0.0)
+
+    def _by_sensor(self, m: mujoco.MjModel, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the constants of each sensor, shape (1,) or (3,)."""
+        found: dict[str, list[float]] = {}
+        names = [sensor for sensor in self.target for _ in range(_axes(m, sensor))]
+        for sensor, value in zip(names, values, strict=True):
+            found.setdefault(sensor, []).append(float(value))
+        return {sensor: np.array(bias) for sensor, bias in found.items()}
 
 
 class SensorGain(MeasurementEffect):
@@ -227,9 +258,8 @@ class SensorGain(MeasurementEffect):
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return the joints' sensors."""
-        group = sensors_by_type(m, JOINTS)
-        return (group,) if group else ()
+        """Return the joints' sensors, forces, and inertial measurements."""
+        return groups(m, JOINTS, FORCES, INERTIAL)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one scale for each sensor."""
@@ -271,13 +301,36 @@ def _shown_free_joints(m: mujoco.MjModel, sensors: Sequence[str], kind: int) -> 
     return sorted(j for j in found if j is not None)
 
 
-def _unit_of_reading(m: mujoco.MjModel, sensor: str) -> str:
-    """Return the unit of what a sensor reads, where it is a joint's position or velocity."""
+def _axes(m: mujoco.MjModel, sensor: str) -> int:
+    """Return along how many axes a sensor reads: three as a vector, else one."""
+    row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, sensor)
+    return 3 if row >= 0 and m.sensor_dim[row] == len("xyz") else 1
+
+
+def _typical_bias(m: mujoco.MjModel, sensor: str) -> tuple[str, float]:
+    """Return the unit of what a sensor reads and how far its zero typically is off."""
     i = m.sensor(sensor).id
-    if int(m.sensor_type[i]) not in JOINTS:
-        return "SI unit"
-    position = "m" if int(m.jnt_type[m.sensor_objid[i]]) == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
-    return position if int(m.sensor_type[i]) == JOINTS[0] else f"{position}/s"
+    kind, target = int(m.sensor_type[i]), int(m.sensor_objid[i])
+    if kind in BIASES:
+        return BIASES[kind]
+    if kind in FORCES:
+        weight = max(float(np.linalg.norm(m.opt.gravity)) * float(m.body_mass.sum()), MIN_WEIGHT)
+        turns = kind == int(mujoco.mjtSensor.mjSENS_TORQUE) or _acts_on_hinge(m, kind, target)
+        return ("N m", WEIGHT_SHARE * weight * LEVER) if turns else ("N", WEIGHT_SHARE * weight)
+    if kind not in JOINTS:
+        return "SI unit", 0.01
+    position = "m" if int(m.jnt_type[target]) == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    return (position if kind == JOINTS[0] else f"{position}/s"), 0.01
+
+
+def _acts_on_hinge(m: mujoco.MjModel, kind: int, target: int) -> bool:
+    """Return whether a sensor reads the torque of a drive or joint, by its kind and the id of that."""
+    if kind == int(mujoco.mjtSensor.mjSENS_ACTUATORFRC):
+        on_joint = int(m.actuator_trntype[target]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+        target = int(m.actuator_trnid[target, 0]) if on_joint else -1
+    elif kind != int(mujoco.mjtSensor.mjSENS_JOINTACTFRC):
+        return False
+    return target >= 0 and int(m.jnt_type[target]) != mujoco.mjtJoint.mjJNT_SLIDE
 
 
 def _shown_joints(m: mujoco.MjModel, sensors: Sequence[str], values: np.ndarray) -> Iterator[tuple[int, int, float]]:
