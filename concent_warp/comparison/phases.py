@@ -3,7 +3,7 @@
 Contact stages (`concent_warp.events`) describe how a robot brings objects together. Where it does not (`has_task`) - a
 toss, a push, a pendulum - the replay is parted by how things move: the contacts that it has and how fast they slip.
 
-| phase | an object, or without any the whole machine |
+| phase | an object, or without any the whole machine: all links that joints connect |
 |---|---|
 | free | touches nothing |
 | impact | is in contact and is jolted harder than any drive would |
@@ -122,8 +122,10 @@ def phases_by_body(
     cfg: MotionPhaseCfg | None = None,
     ctrl: np.ndarray | None = None,
 ) -> dict[str | None, tuple[Phase, ...]]:
-    """Return the phases of motion over a replay, without gaps: of each object, or of each moving body where there is no
-    object, and under None of all of them together.
+    """Return the phases of motion over a replay, without gaps: of each object, or of each machine, under the names of
+    its links, where there is no object, and under None of all of them together.
+
+    A machine is in contact where any of its links is, and rests where all do.
 
     Args:
         model: The model.
@@ -140,12 +142,24 @@ def phases_by_body(
     motion = BodyPoses.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
     pull = None if ctrl is None else adhesion_pull(compiled, rollout.contacts, ctrl)
     touches = ReplayContacts.of(rollout.contacts, roles, pull=pull)
-    movable = np.flatnonzero(compiled.body_weldid != 0)
-    watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
-    speeds = Speeds.of(motion, compiled)
-    states = {roles.bodies[b]: _body_state(b, touches, motion, speeds, roles, cfg) for b in watched}
-    together = np.min([*states.values(), np.full(motion.steps, len(MOTIONS) - 1)], axis=0)
-    return {None: _spans(together, motion.timestep), **{b: _spans(s, motion.timestep) for b, s in states.items()}}
+    movable, speeds = np.flatnonzero(compiled.body_weldid != 0), Speeds.of(motion, compiled)
+    groups = [[b] for b in roles.ids("object") if b in movable] or _machines(compiled, movable)
+    found, together = {}, np.full(motion.steps, MOTIONS.index(REST))
+    for bodies in groups:
+        state = _state(bodies, touches, motion, speeds, roles, cfg)
+        together = np.minimum(together, state)
+        spans = _spans(state, motion.timestep)
+        found |= {roles.bodies[b]: spans for b in bodies}
+    return {None: _spans(together, motion.timestep), **found}
+
+
+def _machines(compiled: mujoco.MjModel, movable: np.ndarray) -> list[list[int]]:
+    """Return movable bodies by what joints connect: those with the same first moving body below them."""
+    root = np.zeros(compiled.nbody, dtype=int)
+    for b in movable:
+        parent = int(compiled.body_parentid[b])
+        root[b] = root[parent] or b
+    return [movable[root[movable] == r].tolist() for r in np.unique(root[movable])]
 
 
 @dataclass(frozen=True)
@@ -213,26 +227,35 @@ def _reaches(compiled: mujoco.MjModel) -> np.ndarray:
     return np.where(bare, np.linalg.norm(compiled.body_ipos, axis=1) + gyration, reach)
 
 
-def _body_state(
-    body: int, touches: ReplayContacts, motion: BodyPoses, speeds: Speeds, roles: Roles, cfg: MotionPhaseCfg
+def _state(
+    bodies: Sequence[int],
+    touches: ReplayContacts,
+    motion: BodyPoses,
+    speeds: Speeds,
+    roles: Roles,
+    cfg: MotionPhaseCfg,
 ) -> np.ndarray:
-    """Return what a body does at each step, shape (K,) int: index into `MOTIONS`."""
+    """Return what bodies that joints connect do at each step, shape (K,) int: index into `MOTIONS`."""
     dt, steps = motion.timestep, motion.steps
-    rows = touches[np.asarray((touches.body == body).any(axis=1))]
-    touching = window_sums(rows.frames(steps).astype(float), steps_of(cfg.majority_window / 2, dt)) > 0
+    rows = touches[np.asarray(np.isin(touches.body, bodies).any(axis=1))]
+    near = steps_of(cfg.majority_window / 2, dt)
+    touching = window_sums(rows.frames(steps).astype(float), near) > 0
     state = np.full(steps, MOTIONS.index(FREE))
     state[touching] = MOTIONS.index(STICK)
     state[touching & (_slip(rows, motion, speeds, cfg.majority_window) > cfg.slide_speed)] = MOTIONS.index(SLIDE)
-    still = drop_short_contacts(speeds.fastest(body) < cfg.rest_speed, steps_of(cfg.min_rest, dt))
-    state[still] = MOTIONS.index(REST)
+    fastest = np.max([speeds.fastest(b) for b in bodies], axis=0)
+    state[drop_short_contacts(fastest < cfg.rest_speed, steps_of(cfg.min_rest, dt))] = MOTIONS.index(REST)
     hands = rows[np.asarray(np.isin(rows.body, roles.ids("robot")).any(axis=1))]
-    if len(hands.step) and roles.body_role[body] != "robot":
+    if len(hands.step) and all(roles.body_role[b] != "robot" for b in bodies):
         held = hands.frames(steps) & forces_cancel(hands, steps, steps_of(cfg.grasp_window, dt), cfg.grasp_share)
         state[held] = MOTIONS.index(GRASPED)
     state = _prevailing(state, steps_of(cfg.majority_window, dt))
     width = steps_of(cfg.impact_window, dt)
-    jolted = touching & (speeds.jolt(body, width) > cfg.impact_acceleration * width * dt)
-    lasting = steps_of(cfg.impact_extension, dt)
+    lasting, jolted = steps_of(cfg.impact_extension, dt), np.zeros(steps, dtype=bool)
+    for b in np.intersect1d(bodies, rows.body):
+        mine = rows[np.asarray((rows.body == b).any(axis=1))]
+        touched = window_sums(mine.frames(steps).astype(float), near) > 0
+        jolted |= touched & (speeds.jolt(int(b), width) > cfg.impact_acceleration * width * dt)
     for start, end in true_runs(jolted):
         state[max(start - width, 0) : end + lasting] = MOTIONS.index(IMPACT)
     return state

@@ -181,3 +181,33 @@ def test_what_a_suction_cup_holds_is_grasped():
     found = phases_by_body(model, engine.compiled, rollout, ctrl=ctrl)["thing"]
     assert "grasped" in names(found)
     assert "grasped" not in names(phases_by_body(model, engine.compiled, rollout)["thing"])
+
+
+TOOL = """
+<mujoco>
+  <option timestep="0.001"/>
+  <worldbody>
+    <geom type="plane" size="2 2 .1" friction=".1"/>
+    <body name="carriage" pos="0 0 .2"><joint type="slide" axis="1 0 0"/><geom type="box" size=".05 .05 .02" mass="1"/>
+      <body name="tool" pos="0 0 -.1"><joint name="down" type="slide" axis="0 0 1" stiffness="20" damping="20"/>
+        <geom size=".02" pos="0 0 -.08" mass=".2" friction=".1"/></body></body>
+    <body name="arm" pos="0 1 1"><joint axis="0 1 0" damping=".001"/><geom size=".02" pos="0 0 -.2" mass=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_machine_is_in_contact_where_any_of_its_links_is_and_others_are_not():
+    model = Model(Scene(TOOL))
+    engine, m = MujocoEngine(model), model.compile()
+    demonstration = Demonstration(
+        "d", qpos=m.qpos0, qvel=np.array([0.5, 0, 3.0]), measured={"c": Channel(np.array([0, 1.0]), np.zeros((2, 1)))}
+    )
+    found = phases_by_body(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
+    assert set(found) == {None, "carriage", "tool", "arm"}
+    assert found["carriage"] == found["tool"]  # one machine, although the tool alone touches the floor
+    assert "slide" in names(found["carriage"])
+    assert "free" not in names(p for p in found["carriage"] if p.start > 0.2)
+    assert names(found["arm"]) == ["free"]
+    # All together do what comes first of what any machine does.
+    assert names(found[None])[0] == names(found["carriage"])[0]
