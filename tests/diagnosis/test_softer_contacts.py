@@ -42,10 +42,11 @@ SPINNING = """
 <sensor><framequat name="turn" objtype="xbody" objname="thing"/></sensor></mujoco>"""
 
 
-def diagnosed(scene: str, recorded: Demonstration, *effects: str) -> Diagnosis:
-    """Return the diagnosis of one demonstration with some candidates."""
+def diagnosed(scene: str, recorded: Demonstration | tuple[Demonstration, ...], *effects: str) -> Diagnosis:
+    """Return the diagnosis of one demonstration, or several, with some candidates."""
     cfg = replace(DiagnoseCfg(), effects=effects, jobs=1, null_samples=100, explain=False)
-    return diagnose(Model(Scene(scene)), Recording(scene, (recorded,)), cfg)
+    demonstrations = recorded if isinstance(recorded, tuple) else (recorded,)
+    return diagnose(Model(Scene(scene)), Recording(scene, demonstrations), cfg)
 
 
 def bounces(restitution: float, time: np.ndarray) -> np.ndarray:
@@ -81,23 +82,31 @@ PUCK = """
 """A puck that glides between cushions; a camera reads its place, a gyroscope that is integrated its heading."""
 
 
-def test_cushions_from_which_a_puck_rebounds_less_than_the_models_are_seen_by_a_camera_alone():
+def shot(number: int, qpos: list[float], qvel: list[float]) -> Demonstration:
+    """Return what a camera and a gyroscope see of a puck from a state on, between cushions with twice the damping."""
     m = mujoco.MjModel.from_xml_string(PUCK.replace('solref="0.04 0.15"', 'solref="0.04 0.3"'))
     m.opt.timestep = 0.0005
-    d, rng, time, states = mujoco.MjData(m), np.random.default_rng(0), np.arange(0, 2.5, 1 / 50), []
-    d.qpos[:], d.qvel[:] = [-0.1, -0.06, 0.0], [0.6, 0.05, 0.3]
+    d, rng, time, states = mujoco.MjData(m), np.random.default_rng(number), np.arange(0, 2.5, 1 / 50), []
+    d.qpos[:], d.qvel[:] = qpos, qvel
     for _ in time:
         states.append(d.qpos.copy())
         for _ in range(40):
             mujoco.mj_step(m, d)
-    seen = np.array(states)
-    height = np.full((len(time), 1), np.nan)
+    seen, height = np.array(states), np.full((len(time), 1), np.nan)
     place = np.hstack([seen[:, :2] + rng.normal(0, 5e-4, (len(time), 2)), height])
     heading = seen[:, 2:] + rng.normal(0, 5e-3, (len(time), 1))
     channels = {"place": Channel(time, place, 5e-4), "heading": Channel(time, heading, 5e-3)}
-    found = diagnosed(PUCK, Demonstration("demo_0", measured=channels), "contact_compliance", "joint_friction", "wind")
+    return Demonstration(f"demo_{number}", measured=channels)
+
+
+def test_cushions_from_which_a_puck_rebounds_less_than_the_models_are_seen_by_a_camera_alone():
+    shots = shot(0, [-0.1, -0.06, 0.0], [0.6, 0.05, 0.3]), shot(1, [0.2, 0.03, 1.0], [-0.9, -0.02, -0.5])
+    found = diagnosed(PUCK, shots, "contact_compliance", "joint_friction", "wind")
     assert found.verdict == "effect"
-    assert [f.name for f in found.accepted] == ["contact_compliance"]
+    (effect,) = found.accepted
+    assert effect.name == "contact_compliance"
+    damping = effect.parameters[1]
+    assert 0.2 < damping.low < 0.3 < damping.high < 0.4
     assert found.ratio[-1] < 1.2
 
 

@@ -198,23 +198,29 @@ def keeps_close(
         scatter = np.clip(np.nan_to_num(scatter), 0.0, cfg.max_scatter_noise)
         curved = np.maximum(curved, np.nan_to_num(bend / np.hypot(1.0, scatter), nan=np.inf))
     passing = 0 if rough or not _can_touch(m) else round(cfg.max_transient / (every * m.opt.timestep))
-    wild = _first_lasting(curved > cfg.max_curvature, passing)
-    reach = span if wild is None else float(record[wild] * m.opt.timestep)
+    end = _end_of_proportion(curved > cfg.max_curvature, passing)
+    reach = span if end is None else float(record[end] * m.opt.timestep)
     return float(np.clip(reach, cfg.min_length, span))
 
 
-def _first_lasting(wild: np.ndarray, most: int) -> int | None:
-    """Return where the first run of more than `most` true values begins, or one that lasts to the end; None for none.
+def _end_of_proportion(wild: np.ndarray, most: int) -> int | None:
+    """Return where a window ends, by whether differences are out of proportion, shape (T,) bool; None at the end.
+
+    A first run of these that is short is passed over, as of one rebound; midway between it and the next one the state
+    is known best, before what follows of that.
 
     Args:
-        wild: Shape (T,) bool.
+        wild: Whether differences are out of proportion.
         most: Most values of a run that is passed over.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wild, [False]]).astype(int)))
-    for begin, end in edges.reshape(-1, 2):
-        if end - begin > most or end == len(wild):
-            return int(begin)
-    return None
+    runs = [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+    if not runs:
+        return None
+    begin, end = runs[0]
+    if end - begin > most or end == len(wild):
+        return begin
+    return (end + runs[1][0]) // 2 if len(runs) > 1 else None
 
 
 def _away(start: np.ndarray, end: np.ndarray, *, turns: bool) -> np.ndarray:

@@ -159,6 +159,17 @@ def test_a_window_goes_on_after_a_rebound_that_one_start_has_earlier_than_its_op
     assert reach(Simulated(rebounding), monkeypatch, rebounds=free, angle=1e-3) == pytest.approx(expected)
 
 
+def test_a_window_ends_midway_between_two_rebounds(monkeypatch):
+    def rebounding(record: np.ndarray) -> np.ndarray:
+        data, time = diverging(0.005)(record), record * 0.005
+        for begin in (0.395, 0.895, 1.095):
+            data[1:, (time > begin) & (time < begin + 0.05), 0] += 0.1
+        return data
+
+    monkeypatch.setattr(observing, "_can_touch", lambda _: True)
+    assert reach(Simulated(rebounding), monkeypatch, angle=1e-3) == pytest.approx(0.67)
+
+
 def test_a_window_ends_where_starts_differ_shortly_before_its_end(monkeypatch):
     def late(record: np.ndarray) -> np.ndarray:
         data = diverging(0.005)(record)
