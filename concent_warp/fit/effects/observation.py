@@ -68,9 +68,9 @@ class ObservationCfg:
     scatter, at which a window ends [-]: beyond it, the effect of an error is no longer in proportion to it.
     Empirical."""
     max_transient: Annotated[float, Bounds(0)] = 0.1
-    """Longest time of such deviations that a window goes on after, once [s]: of the rebound of a body on joints, which
-    one start has earlier than its opposite, and after which the effect is in proportion again; the body of a free joint
-    leaves it with another spin. Empirical."""
+    """Longest time of such deviations that a window goes on after, once [s]: of the rebound of a body on joints without
+    drives, which one start has earlier than its opposite, and after which the effect is in proportion again. The body
+    of a free joint leaves it with another spin; drives press bodies together again. Empirical."""
     max_scatter_noise: Positive = 5.0
     """Largest numerical scatter that is taken into account there, over the noise [-]: chaotic motion scatters without
     limit. Empirical."""

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from concent_warp.recording.recording import Demonstration, Recording
 
 
+LEAST_FLIGHT = 3
+"""Least time between two rebounds over `ObservationCfg.max_transient` [-]."""
+
+
 def channel_noises(model: Model, recording: Recording, cfg: ObservationCfg | None = None) -> dict[str, float]:
     """Return the noise of each channel that the model's sensors predict, standard deviation of a component.
 
@@ -152,6 +156,11 @@ def _can_touch(m: mujoco.MjModel) -> bool:
     return bool(m.npair or (m.geom_contype | m.geom_conaffinity).any())
 
 
+def _may_rebound(m: mujoco.MjModel) -> bool:
+    """Return whether a body on joints may rebound and fly on: something can touch, and no drive presses it."""
+    return _can_touch(m) and not m.nu
+
+
 def has_touchable_free_body(m: mujoco.MjModel) -> bool:
     """Return whether a body moves freely in a scene in which something can touch."""
     return bool((m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any()) and _can_touch(m)
@@ -197,7 +206,7 @@ def keeps_close(
             scatter = np.sqrt((_rms(away[near:]) ** 2).mean(axis=0)) if rough else np.zeros(len(record))
         scatter = np.clip(np.nan_to_num(scatter), 0.0, cfg.max_scatter_noise)
         curved = np.maximum(curved, np.nan_to_num(bend / np.hypot(1.0, scatter), nan=np.inf))
-    passing = 0 if rough or not _can_touch(m) else round(cfg.max_transient / (every * m.opt.timestep))
+    passing = round(cfg.max_transient / (every * m.opt.timestep)) if _may_rebound(m) and not rough else 0
     end = _end_of_proportion(curved > cfg.max_curvature, passing)
     reach = span if end is None else float(record[end] * m.opt.timestep)
     return float(np.clip(reach, cfg.min_length, span))
@@ -206,8 +215,9 @@ def keeps_close(
 def _end_of_proportion(wild: np.ndarray, most: int) -> int | None:
     """Return where a window ends, by whether differences are out of proportion, shape (T,) bool; None at the end.
 
-    A first run of these that is short is passed over, as of one rebound; midway between it and the next one the state
-    is known best, before what follows of that.
+    A first run of these that is short is passed over, as of one rebound after which a body flies; midway between it and
+    the next one the state is known best, before what follows of that. It is not where the next one begins soon: then
+    contacts are made and broken.
 
     Args:
         wild: Whether differences are out of proportion.
@@ -220,7 +230,10 @@ def _end_of_proportion(wild: np.ndarray, most: int) -> int | None:
     begin, end = runs[0]
     if end - begin > most or end == len(wild):
         return begin
-    return (end + runs[1][0]) // 2 if len(runs) > 1 else None
+    if len(runs) == 1:
+        return None
+    following = runs[1][0]
+    return (end + following) // 2 if following - end >= LEAST_FLIGHT * most else begin
 
 
 def _away(start: np.ndarray, end: np.ndarray, *, turns: bool) -> np.ndarray:

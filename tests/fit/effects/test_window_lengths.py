@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -144,30 +145,40 @@ def test_differences_that_are_not_finite_end_a_window_and_none_is_longer_than_th
 
 
 @pytest.mark.parametrize(
-    ("lasts", "touch", "free", "expected"),
+    ("lasts", "rebounds", "free", "expected"),
     [(0.08, True, False, 1.4), (0.16, True, False, 0.4), (0.08, False, False, 0.4), (0.08, True, True, 0.4)],
 )
 def test_a_window_goes_on_after_a_rebound_that_one_start_has_earlier_than_its_opposite(
-    monkeypatch, lasts, touch, free, expected
+    monkeypatch, lasts, rebounds, free, expected
 ):
     def rebounding(record: np.ndarray) -> np.ndarray:
         data, time = diverging(0.005)(record), record * 0.005
         data[1:, (time > 0.395) & (time < 0.395 + lasts), 0] += 0.1
         return data
 
-    monkeypatch.setattr(observing, "_can_touch", lambda _: touch)
+    monkeypatch.setattr(observing, "_may_rebound", lambda _: rebounds)
     assert reach(Simulated(rebounding), monkeypatch, rebounds=free, angle=1e-3) == pytest.approx(expected)
 
 
-def test_a_window_ends_midway_between_two_rebounds(monkeypatch):
+def test_what_drives_press_together_does_not_rebound_and_fly_on():
+    driven = swing_scene()
+    free = driven.replace('<actuator><position name="servo" joint="hinge" kp="1.0" kv="0.01"/></actuator>', "")
+    alone = free.replace('mass="0.3"', 'mass="0.3" contype="0" conaffinity="0"')
+    assert free != driven
+    found = [observing._may_rebound(mujoco.MjModel.from_xml_string(xml)) for xml in (driven, free, alone)]
+    assert found == [False, True, False]
+
+
+@pytest.mark.parametrize(("second", "expected"), [(0.895, 0.67), (0.705, 0.4)])
+def test_a_window_ends_midway_between_two_rebounds_and_at_the_first_of_several_in_a_row(monkeypatch, second, expected):
     def rebounding(record: np.ndarray) -> np.ndarray:
         data, time = diverging(0.005)(record), record * 0.005
-        for begin in (0.395, 0.895, 1.095):
+        for begin in (0.395, second, 1.095):
             data[1:, (time > begin) & (time < begin + 0.05), 0] += 0.1
         return data
 
-    monkeypatch.setattr(observing, "_can_touch", lambda _: True)
-    assert reach(Simulated(rebounding), monkeypatch, angle=1e-3) == pytest.approx(0.67)
+    monkeypatch.setattr(observing, "_may_rebound", lambda _: True)
+    assert reach(Simulated(rebounding), monkeypatch, angle=1e-3) == pytest.approx(expected)
 
 
 def test_a_window_ends_where_starts_differ_shortly_before_its_end(monkeypatch):
@@ -176,7 +187,7 @@ def test_a_window_ends_where_starts_differ_shortly_before_its_end(monkeypatch):
         data[1:, record * 0.005 > 1.345, 0] += 0.1
         return data
 
-    monkeypatch.setattr(observing, "_can_touch", lambda _: True)
+    monkeypatch.setattr(observing, "_may_rebound", lambda _: True)
     assert reach(Simulated(late), monkeypatch, angle=1e-3) == pytest.approx(1.35)
 
 
