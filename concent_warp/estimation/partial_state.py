@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.estimation.ball_signals import ball_signals
-from concent_warp.estimation.joint_signals import determined_joints, joint_rates, joint_signals
+from concent_warp.estimation.joint_signals import CoupledJoints, determined_joints, joint_rates, joint_signals
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.recording.recording import Channel
@@ -41,8 +41,21 @@ class PartialState:
     """Of which degrees of freedom positions were measured, shape (nv,) bool."""
 
 
+def told_joints(
+    m: mujoco.MjModel, demonstration: Demonstration, cfg: LocalPolynomialCfg | None = None
+) -> tuple[CoupledJoints, np.ndarray]:
+    """Return the hinges and slides, and which of them nothing tells, shape (J,) bool, see `determined_joints`."""
+    cfg = cfg or LocalPolynomialCfg()
+    return determined_joints(m, demonstration, cfg, joint_signals(m, demonstration, cfg), MIN_SINGULAR)
+
+
 def partial_state(
-    m: mujoco.MjModel, demonstration: Demonstration, time: float, cfg: LocalPolynomialCfg | None = None
+    m: mujoco.MjModel,
+    demonstration: Demonstration,
+    time: float,
+    cfg: LocalPolynomialCfg | None = None,
+    *,
+    joints: tuple[CoupledJoints, np.ndarray] | None = None,
 ) -> PartialState:
     """Return the state at a time, as far as it was measured.
 
@@ -51,16 +64,16 @@ def partial_state(
         demonstration: What was measured.
         time: Time [s].
         cfg: How readings are smoothed.
+        joints: What `told_joints` found, where several times are asked for.
     """
     cfg, at = cfg or LocalPolynomialCfg(), np.array([time])
     qpos, qvel = initial_state(m, demonstration)
     measured = np.zeros(m.nv, dtype=bool)
-    joints = joint_signals(m, demonstration, cfg)
-    for joint in joints:
+    for joint in joint_signals(m, demonstration, cfg):
         found = joint.position.estimate(at)
         qpos[joint.qpos], qvel[joint.dof] = found.value[0, 0], found.rate[0, 0]
         measured[joint.dof] = True
-    coupled, loose = determined_joints(m, demonstration, cfg, joints, MIN_SINGULAR)
+    coupled, loose = told_joints(m, demonstration, cfg) if joints is None else joints
     if len(others := np.flatnonzero(~loose & ~measured[coupled.dof])):
         found = coupled.estimate(at)
         qpos[coupled.qpos[others]], qvel[coupled.dof[others]] = found.value[0, others], found.rate[0, others]

@@ -18,13 +18,14 @@ import numpy as np
 
 from concent_warp.checks import Bounds, Count, Positive, PositiveDuration, Share
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.partial_state import PartialState, partial_state
+from concent_warp.estimation.partial_state import PartialState, partial_state, told_joints
 from concent_warp.estimation.sample_noise import covariance_std, relative_whitening, whitened
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
 if TYPE_CHECKING:
+    from concent_warp.estimation.joint_signals import CoupledJoints
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
 
@@ -408,6 +409,8 @@ class ObservedRecording:
     """Settings."""
     _measured: dict[int, tuple[Demonstration, StateEstimator | None]] = field(default_factory=dict, repr=False)
     """Estimated motions so far, by the identity of the demonstration."""
+    _told: dict[int, tuple[Demonstration, tuple[CoupledJoints, np.ndarray]]] = field(default_factory=dict, repr=False)
+    """Joints that were measured so far, where others were not, likewise."""
 
     def state(self, d: Demonstration, time: float) -> PartialState:
         """Return the state of a demonstration at a time [s], as recorded or measured, else of the reference pose."""
@@ -418,7 +421,9 @@ class ObservedRecording:
         if (estimator := self.measured(d)) is not None:
             states = estimator.states(np.array([time]))
             return PartialState(states.qpos[0], states.qvel[0], every)
-        found = partial_state(m, d, time)
+        if id(d) not in self._told:
+            self._told[id(d)] = (d, told_joints(m, d))
+        found = partial_state(m, d, time, joints=self._told[id(d)][1])
         if time <= 0.0 and d.qpos is not None:
             return replace(found, qpos=initial_state(m, d)[0])
         return found
