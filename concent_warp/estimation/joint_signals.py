@@ -25,6 +25,8 @@ SENSOR = mujoco.mjtSensor
 HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 RATE_SENSORS = {SENSOR.mjSENS_JOINTPOS: SENSOR.mjSENS_JOINTVEL, SENSOR.mjSENS_TENDONPOS: SENSOR.mjSENS_TENDONVEL}
 """The sensor that measures the rate of what another one measures."""
+MIN_SINGULAR = 1e-6
+"""Smallest singular value of the equations that determine joints; below it some joint counts as not measured."""
 SmootherCfg = LocalPolynomialCfg | SmoothingSplineCfg
 
 

@@ -15,7 +15,13 @@ import mujoco
 import numpy as np
 
 from concent_warp.estimation.ball_signals import ball_signals
-from concent_warp.estimation.joint_signals import CoupledJoints, determined_joints, joint_rates, joint_signals
+from concent_warp.estimation.joint_signals import (
+    MIN_SINGULAR,
+    CoupledJoints,
+    determined_joints,
+    joint_rates,
+    joint_signals,
+)
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.recording.recording import Channel
@@ -23,10 +29,6 @@ from concent_warp.simulate.replay import initial_state
 
 if TYPE_CHECKING:
     from concent_warp.recording.recording import Demonstration
-
-
-MIN_SINGULAR = 1e-6
-"""Smallest singular value of equations that determine joints, as of `StateEstimatorCfg`."""
 
 
 @dataclass(frozen=True)

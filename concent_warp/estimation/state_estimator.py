@@ -16,7 +16,13 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.ball_signals import BALL, ball_signals
 from concent_warp.estimation.body_signals import polynomial_bodies, spline_bodies
-from concent_warp.estimation.joint_signals import HINGE_OR_SLIDE, CoupledJoints, coupled_joints, joint_signals
+from concent_warp.estimation.joint_signals import (
+    HINGE_OR_SLIDE,
+    MIN_SINGULAR,
+    CoupledJoints,
+    coupled_joints,
+    joint_signals,
+)
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
 from concent_warp.estimation.signals import MeasuredBall, MeasuredBody, MeasuredJoint, OrientationSignal, Signal
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
@@ -41,7 +47,7 @@ class StateEstimatorCfg:
     """Settings of local polynomials."""
     spline: SmoothingSplineCfg = field(default_factory=SmoothingSplineCfg)
     """Settings of smoothing splines."""
-    min_singular: float = 1e-6
+    min_singular: float = MIN_SINGULAR
     """Local polynomials: smallest singular value of the equations (sensors of joints and tendons, equalities) that
     determine the joints; below it some joint counts as not measured."""
     support_share: float = 0.3

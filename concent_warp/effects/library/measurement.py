@@ -36,10 +36,10 @@ class MeasurementEffect(Effect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the poses of bodies, and the joints."""
-        return groups(m, POSES, JOINTS)
+        return instruments(m, POSES, JOINTS)
 
 
-def groups(m: mujoco.MjModel, *kinds: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
+def instruments(m: mujoco.MjModel, *kinds: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
     """Return the names of the sensors of each of some kinds, where there are any: an instrument each."""
     return tuple(group for kind in kinds if (group := sensors_by_type(m, kind)))
 
@@ -79,7 +79,7 @@ class Latency(MeasurementEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the poses of bodies, the joints, forces, and inertial measurements."""
-        return groups(m, POSES, JOINTS, FORCES, INERTIAL)
+        return instruments(m, POSES, JOINTS, FORCES, INERTIAL)
 
     @classmethod
     def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -212,7 +212,7 @@ class SensorBias(MeasurementEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the joints' positions, forces, and inertial measurements."""
-        return groups(m, JOINTS[:1], FORCES, INERTIAL)
+        return instruments(m, JOINTS[:1], FORCES, INERTIAL)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return one constant for each sensor, along each of its axes."""
@@ -259,7 +259,7 @@ class SensorGain(MeasurementEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the joints' sensors, forces, and inertial measurements."""
-        return groups(m, JOINTS, FORCES, INERTIAL)
+        return instruments(m, JOINTS, FORCES, INERTIAL)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one scale for each sensor."""
