@@ -123,9 +123,12 @@ def multiple_shooting_candidate(
     """Return the better of a fit and its refit from the values of a multiple-shooting fit over short windows.
 
     Over long windows stick and slip cause many local minima; short ones, each with its own initial state, have few
-    (multiple shooting: Bock 1983).
+    (multiple shooting: Bock 1983). Derivatives alone lead to these states.
     """
-    values = candidate_solver(base, candidate.effect, short_windows).fit(candidate.fit.values).values
+    cfg = base.cfg.least_squares
+    states = replace(cfg.initial_states, sample_spreads=(), restart_samples=0)
+    short = Solver(base.prediction(candidate.effect, windows=short_windows), replace(cfg, initial_states=states))
+    values = short.fit(candidate.fit.values).values
     solver = candidate_solver(base, candidate.effect)
     fit = solver.fit(values, base.fit.offsets, base.fit.starts)
     return _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))

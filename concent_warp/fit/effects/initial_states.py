@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from concent_warp.checks import Positive
+from concent_warp.checks import Count, Positive
 from concent_warp.fit.effects.fading import FadingCfg, ReferenceSimulation, is_long, residuals_near
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
@@ -65,6 +65,13 @@ class InitialStateCfg:
     `outlier_ratio` in good fits, too. Empirical."""
     restart_samples: int = 128
     """States sampled about the measured one, of which the likeliest restarts an outlying window; 0 for none."""
+    restart_trials: Count = 16
+    """Of these, how many tell whether the initial state matters [-]: a window is restarted from none where half of them
+    cost no more than `restart_rise` beyond the least cost."""
+    restart_rise: Positive = 0.5
+    """Share of the least cost of a window by which half of these samples must exceed it [-]: where a model lacks an
+    effect, that leaves more than any initial state does, and others end where the search has ended already.
+    Empirical."""
     restart_spreads: tuple[float, ...] = (0.5, 1.0, 2.0)
     """Spreads of these samples, used in turn, in units of the state's spread [-]."""
     fading: FadingCfg = field(default_factory=FadingCfg)
@@ -185,7 +192,7 @@ class InitialStateSearch:
         )
         if outlying and self.cfg.restart_samples:
             found, limit = dict(starts), huber_limit(residuals, self.robust)
-            begin, there = self._restarts(values, offsets, residuals, outlying, limit, rng)
+            begin, there, outlying = self._restarts(values, offsets, residuals, outlying, limit, rng)
             beaten = {w: start_cost(residuals[w], offsets[w], limit, self.robust) for w in outlying}
             self._iterate(values, begin, there, found, outlying, iterations, rng, beaten)
             for w in outlying:
@@ -201,23 +208,34 @@ class InitialStateSearch:
         windows: Sequence[int],
         limit: float,
         rng: np.random.Generator,
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return all initial states, with the likeliest of random samples for some windows, and all residuals."""
+    ) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
+        """Return all initial states, with the likeliest of random samples for some windows, and all residuals.
+
+        The last is for which of these windows there are samples: not for those whose cost they hardly change.
+        """
         count = self.cfg.restart_samples
+        first = min(self.cfg.restart_trials, count)
         begin, there = list(offsets), list(residuals)
         widths = np.resize(self.cfg.restart_spreads, (count, 1))
-        samples = [widths * rng.normal(size=(count, len(offsets[w]))) for w in windows]
-        rows = [
-            SimulationRequest(w, values, o * self.p.windows[w].spread)
-            for w, of in zip(windows, samples, strict=True)
-            for o in of
-        ]
-        seen = self.p.residuals(rows)
-        for k, w in enumerate(windows):
-            mine = seen[k * count : (k + 1) * count]
-            best = int(np.argmin([start_cost(r, o, limit, self.robust) for r, o in zip(mine, samples[k], strict=True)]))
-            begin[w], there[w] = samples[k][best], mine[best]
-        return begin, there
+        samples = {w: widths * rng.normal(size=(count, len(offsets[w]))) for w in windows}
+        seen, chosen = self._residuals_of({w: of[:first] for w, of in samples.items()}, values), []
+        for w in windows:
+            costs = [start_cost(r, o, limit, self.robust) for r, o in zip(seen[w], samples[w], strict=False)]
+            least = min(start_cost(residuals[w], offsets[w], limit, self.robust), *costs)
+            if np.median(costs) > (1 + self.cfg.restart_rise) * least:
+                chosen.append(w)
+        more = self._residuals_of({w: samples[w][first:] for w in chosen}, values)
+        for w in chosen:
+            mine = [*seen[w], *more[w]]
+            best = int(np.argmin([start_cost(r, o, limit, self.robust) for r, o in zip(mine, samples[w], strict=True)]))
+            begin[w], there[w] = samples[w][best], mine[best]
+        return begin, there, chosen
+
+    def _residuals_of(self, samples: Mapping[int, np.ndarray], values: np.ndarray) -> dict[int, list[np.ndarray]]:
+        """Return the residuals of each window at some initial states, one a row, by window."""
+        rows = [SimulationRequest(w, values, o * self.p.windows[w].spread) for w, of in samples.items() for o in of]
+        found = iter(self.p.residuals(rows))
+        return {w: [next(found) for _ in of] for w, of in samples.items()}
 
     def _iterate(
         self,

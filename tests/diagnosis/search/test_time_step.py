@@ -194,6 +194,17 @@ def test_defects_are_renewed_until_they_stay(finer, monkeypatch):
     assert len(done) == 2
 
 
+def test_defects_that_do_not_come_to_stay_are_renewed_no_further(finer, monkeypatch):
+    done: list[FittedModel] = []
+    monkeypatch.setattr(module, "refitted", lambda one: done.append(one) or one)
+    for changes, times in (([9.0, 9.0, 0.1], 2), ([9.0, 6.0, 0.1], 3), ([9.0, 6.0, 5.0, 0.1], 3)):
+        left = iter(changes)
+        monkeypatch.setattr(module, "noise_ratio", lambda _change, left=left: next(left))
+        done.clear()
+        renew_defects(finer, TimeStepCfg())
+        assert len(done) == times
+
+
 def test_an_effect_is_found_beside_a_step_that_is_too_long():
     recording = swung(damping=DAMPING, timestep=FINE)
     coarse = module._with_defects(fitted(recording), FINE)
@@ -236,6 +247,8 @@ def test_states_far_off_are_fitted_by_simulations_with_the_shorter_step():
     assert simulated_steps(found) == TIMESTEP
     near = replace(lost, fit=replace(one.fit, offsets=(*spoiled[:1], np.full(2, least), *spoiled[2:])))
     assert module._at_states_of_shorter_step(near, TimeStepCfg()) is None
+    # At the measured states the shorter step leaves a small part of what the long one does, but not none.
+    assert module._at_states_of_shorter_step(lost, TimeStepCfg(least_shrinking=0.0)) is None
 
 
 @pytest.mark.parametrize(
