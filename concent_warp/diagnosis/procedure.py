@@ -151,8 +151,9 @@ class Procedure:
             if stands and not self._is_small(given):
                 return given, fitted, detectable
         budget, settled = context.budget, context.record
-        cut, unsettled = budget.cut, budget.unsettled
-        context.record, budget.cut, budget.unsettled = replace(begun, beside_impacts=True), set(), []
+        cut, doubted, unsettled = budget.cut, budget.doubted, budget.unsettled
+        context.record = replace(begun, beside_impacts=True)
+        budget.cut, budget.doubted, budget.unsettled = set(), set(), []
         beside, smallest = self.search(rough)
         count = len(self.record.accepted())
         enough = context.explains(beside[-1], rough, added=count > 0)
@@ -164,7 +165,8 @@ class Procedure:
         if enough and not budget.cut:
             self.impacts_left = True
             return rough, beside, smallest
-        context.record, budget.cut, budget.unsettled = settled, cut, unsettled
+        context.record = settled
+        budget.cut, budget.doubted, budget.unsettled = cut, doubted, unsettled
         return given, fitted, detectable
 
     def _may_be_hidden(self) -> bool:

@@ -29,6 +29,9 @@ class TimeBudget:
         """Sentences on what there was no time for."""
         self.cut: set[int] = set()
         """Indices of the additions whose search was not finished."""
+        self.doubted: set[int] = set()
+        """Indices of the additions to a model that leaves little more than noise, where there was no time to try
+        whether its time step, nominal values or other initial states explain that as well."""
 
     def left(self) -> float:
         """Return the time that is left [s], infinite where it is unlimited."""
@@ -40,7 +43,9 @@ class TimeBudget:
         with stop_at(None if self.seconds is None else self.begun + share * self.seconds):
             yield
 
-    def attempt(self, work: Callable[[], T], otherwise: T, unsettled: str, share: float = 1.0) -> T:
+    def attempt(
+        self, work: Callable[[], T], otherwise: T, unsettled: str, share: float = 1.0, doubted: int | None = None
+    ) -> T:
         """Return the result of some work, or what there is otherwise where the time does not suffice for it.
 
         Args:
@@ -48,12 +53,15 @@ class TimeBudget:
             otherwise: Result without it.
             unsettled: Sentence on what is not settled then.
             share: Share of the time after which it stops, 0..1.
+            doubted: Index of the addition that is in doubt without it, see `doubted`.
         """
         try:
             with self.until(share):
                 return work()
         except TimeUpError:
             self.note(unsettled)
+            if doubted is not None:
+                self.doubted.add(doubted)
             return otherwise
 
     def note(self, sentence: str, cut: int | None = None) -> None:
@@ -66,14 +74,14 @@ class TimeBudget:
     def verdict(self, found: Verdict, accepted: Sequence[int]) -> Verdict:
         """Return a verdict, or "unsettled" where candidates that might change it were not fitted.
 
-        An accepted effect stands where all that could have been accepted in its place were fitted; that nothing, or
-        nothing in the library, is missing takes a search to its end.
+        An accepted effect stands where all that could have been accepted in its place were fitted, and what else might
+        explain a little; that nothing, or nothing in the library, is missing takes a search to its end.
 
         Args:
             found: The verdict on what was computed.
             accepted: Indices of the additions in which an effect was accepted.
         """
-        decisive = self.cut & set(accepted) if found in ("effect", "group") else self.cut
+        decisive = (self.cut | self.doubted) & set(accepted) if found in ("effect", "group") else self.cut
         return "unsettled" if decisive else found
 
 

@@ -132,7 +132,7 @@ def test_a_search_ends_with_a_shorter_time_step_that_leaves_no_more_than_noise(m
     for ratio, factor, more in ((1.02, 1.0, False), (1.03, 1.0, True), (1.4, 1.4, False), (1.5, 1.4, True)):
         made, finer = procedure(), node(ratio, 10.0, timestep=FINER)
         made.context.noise_factors = {"angle": factor}
-        monkeypatch.setattr(made.additions, "_finer", lambda one, finer=finer: finer if one is given else None)
+        monkeypatch.setattr(made.additions, "_finer", lambda one, _step, finer=finer: finer if one is given else None)
         monkeypatch.setattr(made.additions.finder, "find", lambda base, *_, **_k: asked.append(base) or (None, ()))
         asked.clear()
         assert made.additions.add_effects([given], ())[0] == [finer]

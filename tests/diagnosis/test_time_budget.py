@@ -12,6 +12,7 @@ from concent_warp.diagnosis import time_budget
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import VERDICTS
+from concent_warp.diagnosis.search import additions, context, find_addition
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks, run_tasks_in_time
 from concent_warp.diagnosis.time_budget import TimeBudget, in_words
 from concent_warp.model import Model
@@ -129,7 +130,7 @@ def test_an_effect_that_leaves_an_error_of_form_is_the_answer_where_the_time_end
     recording = ridden(friction=FRICTION, force=bump)
     model = Model(Scene(rail()))
     found = {}
-    for looks in (140, 220, 400):
+    for looks in (120, 220, 400):
         with monkeypatch.context() as patch:
             Clock(patch)
             found[looks] = diagnose(model, recording, replace(CFG, seconds=looks))
@@ -197,3 +198,28 @@ def test_many_names_are_counted():
 
 def test_shares_of_the_time_leave_some_for_the_end():
     assert 0 < time_budget.SEARCH_SHARE < time_budget.PROFILE_SHARE < time_budget.TOGETHER_SHARE < 1
+
+
+@pytest.mark.parametrize(("quiet", "verdict"), [(True, "unsettled"), (False, "effect")])
+@pytest.mark.parametrize(
+    ("module", "work"),
+    [(context, "nominal_sensitivities"), (additions, "finer_time_step"), (find_addition, "refit_from_rivals")],
+)
+def test_an_effect_beside_little_more_than_noise_is_not_settled_without_what_else_might_explain_that(
+    monkeypatch, quiet, verdict, module, work
+):
+    recording = swung(damping=4e-4)
+    cfg = replace(CFG, search=replace(CFG.search, doubtful_gain=1.1))
+    if quiet:
+        for one in (additions, find_addition):
+            monkeypatch.setattr(one, "least_ratio", lambda *_: 1.0)
+    assert diagnose(drawing(recording), recording, cfg).verdict == "effect"
+
+    def no_time(*_args):
+        raise TimeUpError
+
+    monkeypatch.setattr(module, work, no_time)
+    found = diagnose(drawing(recording), recording, cfg)
+    assert found.verdict == verdict
+    assert [f.name for f in found.accepted] == ["joint_damping"]
+    assert found.unsettled

@@ -71,7 +71,7 @@ class Additions:
                 break
             if step and not effects_alone:
                 fitted[-1] = self.with_holding(fitted[-1])
-            finer = None if effects_alone else self._finer(fitted[-1])
+            finer = None if effects_alone else self._finer(fitted[-1], step)
             if finer is not None and not is_lacking(finer, factors, cfg):
                 fitted = self._adopt(fitted, finer)
                 break
@@ -232,15 +232,22 @@ class Additions:
         held = self._held(one)
         return None if held is one else held
 
-    def _finer(self, one: FittedModel) -> FittedModel | None:
-        """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
+    def _finer(self, one: FittedModel, step: int | None = None) -> FittedModel | None:
+        """Return a fitted model with a shorter time step where that explains more and none has been adopted yet.
+
+        Args:
+            one: The fitted model.
+            step: Index of the addition beside which it is tried, None for none.
+        """
         context = self.context
         if context.record.time_step is not None:
             return None
         context.progress("halving the time step")
         unsettled = "Open: whether the model's time step is too long."
         cfg = replace(context.cfg, min_gain=context.least_gain(one))
-        return context.budget.attempt(lambda: finer_time_step(one, cfg), None, unsettled)
+        quiet = least_ratio(one, context.noise_factors) <= cfg.search.explained_ratio
+        doubted = step if quiet else None
+        return context.budget.attempt(lambda: finer_time_step(one, cfg), None, unsettled, doubted=doubted)
 
     def _is_decisive(self, one: FittedModel, finer: FittedModel) -> bool:
         """Return whether a shorter time step explains so much that no effect may take its place."""

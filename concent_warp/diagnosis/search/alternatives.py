@@ -38,7 +38,7 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
     """
     context, first = additions.context, fitted[0]
     cfg, budget, begun = context.cfg, context.budget, context.record
-    cut, unsettled = set(budget.cut), list(budget.unsettled)
+    cut, doubted, unsettled = set(budget.cut), set(budget.doubted), list(budget.unsettled)
     answers = [(fitted, begun)]
     equals = set(begun.groups[0])
     rivals = begun.rivals.get(0, ())
@@ -56,11 +56,11 @@ def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[Fi
         found = budget.attempt(lambda r=rival: _from(additions, first, r), None, open_question)
         tried.append(rival)
         others = [r for r in others if not any(r.is_like(t, cfg.search.parallel_rivals) for t in tried)]
-        if found is not None and budget.cut == cut:
+        if found is not None and (budget.cut, budget.doubted) == (cut, doubted):
             answers.append((found, context.record))
             continue
         # The first answer is none the less complete.
-        budget.cut, budget.unsettled = set(cut), list(unsettled)
+        budget.cut, budget.doubted, budget.unsettled = set(cut), set(doubted), list(unsettled)
         budget.note(open_question)
         unsettled = list(budget.unsettled)
     least = min(answers, key=lambda answer: answer[0][-1].errors.sum())[0][-1]

@@ -174,14 +174,16 @@ class SearchContext:
         fit = partial(with_nominal_values, one, self.cfg.nominal, least, beside.sensitivities, dependent)
         return self.budget.attempt(fit, None, unsettled)
 
-    def beside_nominal(self, base: FittedModel) -> BesideNominalValues | None:
+    def beside_nominal(self, base: FittedModel, doubted: int | None = None) -> BesideNominalValues | None:
         """Return what compares candidates for a fitted model beside nominal values, None where there was no time.
 
         Args:
             base: The fitted model.
+            doubted: Index of the addition that is in doubt without it, see `TimeBudget.doubted`.
         """
         if self._beside is None or self._beside.base is not base:
             unsettled = "Left out of the comparison of candidates: errors of nominal values."
-            found = self.budget.attempt(partial(nominal_sensitivities, base), None, unsettled)
+            work = partial(nominal_sensitivities, base)
+            found = self.budget.attempt(work, None, unsettled, doubted=doubted)
             self._beside = None if found is None else BesideNominalValues(base, found)
         return self._beside

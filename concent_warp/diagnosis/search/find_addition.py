@@ -92,6 +92,7 @@ class AdditionFinder:
         if not screened:  # the model has all that were asked for
             return None, ()
         quiet = least_ratio(base, context.noise_factors) <= cfg.search.explained_ratio
+        doubted = step if quiet else None
         small = quiet and explained and step == 0 and self._is_as_given(base)
         if quiet:
             # What shows in the size of the residual no more than noise does must show the clearer in its structure.
@@ -130,11 +131,12 @@ class AdditionFinder:
         if rivals and max(c.share(base) for c in rivals) < cfg.search.doubtful_gain:
             leading = sorted(rivals, key=lambda c: -c.share(base))[: cfg.search.rivals]
             unsettled = "Open: whether other initial states let the model explain more without an effect."
-            base = context.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
+            again = partial(refit_from_rivals, base, leading)
+            base = context.budget.attempt(again, base, unsettled, doubted=doubted)
             findings = [finding(c) for c in fitted]
         # Of the base as it is now: its initial states may have been fitted anew.
         wanted = (explained or beside_nominal) and any(f.accepted for f in findings)
-        beside = context.beside_nominal(base) if wanted else None
+        beside = context.beside_nominal(base, doubted if beside_nominal else None) if wanted else None
         if explained:
             findings = self._established(base, fitted, findings, beside, quiet=quiet)
         elif not quiet:

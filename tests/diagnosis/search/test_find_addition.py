@@ -219,7 +219,7 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
     monkeypatch.setattr(find_addition, "nominal_errors", lambda c, _cfg, shared: f"nominal {c.name} {shared}")
     compared = []
 
-    def comparison(base):
+    def comparison(base, _doubted=None):
         compared.append(base)
         return Comparison(base)
 
@@ -249,7 +249,7 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
 def leaving(before: float, after: float) -> Any:
     """Return what finds that so much is left beside nominal values of the model, and of the candidate "a"."""
     left = {"": np.full(4, before / 4), "a": np.full(4, after / 4)}
-    return lambda base: Comparison(base, left)
+    return lambda base, _doubted=None: Comparison(base, left)
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_candidates_are_promoted_and_compared_beside_nominal_values_where_that_i
             promoted.append((screened, cfg.min_gain))
             return screened
 
-    made.context.beside_nominal = lambda base: Asked(base, decides=decides)
+    made.context.beside_nominal = lambda base, _doubted=None: Asked(base, decides=decides)
     searched(
         monkeypatch,
         made,
