@@ -160,8 +160,11 @@ class Additions:
     def _is_futile(self, one: FittedModel) -> bool:
         """Return whether no further effect could be accepted: down to the noise, less is left than it must remove."""
         cfg = self.context.cfg
-        quiet = least_ratio(one, self.context.noise_factors) <= cfg.search.explained_ratio
-        return 1 - 1 / one.ratio**2 < (cfg.quiet_min_gain if quiet else cfg.min_gain)
+        return 1 - 1 / one.ratio**2 < (cfg.quiet_min_gain if self._is_quiet(one) else cfg.min_gain)
+
+    def _is_quiet(self, one: FittedModel) -> bool:
+        """Return whether a model leaves little more than noise."""
+        return least_ratio(one, self.context.noise_factors) <= self.context.cfg.search.explained_ratio
 
     def _is_unsettled_remainder(self, one: FittedModel, first: FittedModel, step: int) -> bool:
         """Return whether a model leaves no more than errors in formulas, and the search for a further effect was cut.
@@ -245,8 +248,7 @@ class Additions:
         context.progress("halving the time step")
         unsettled = "Open: whether the model's time step is too long."
         cfg = replace(context.cfg, min_gain=context.least_gain(one))
-        quiet = least_ratio(one, context.noise_factors) <= cfg.search.explained_ratio
-        doubted = step if quiet else None
+        doubted = step if self._is_quiet(one) else None
         return context.budget.attempt(lambda: finer_time_step(one, cfg), None, unsettled, doubted=doubted)
 
     def _is_decisive(self, one: FittedModel, finer: FittedModel) -> bool:

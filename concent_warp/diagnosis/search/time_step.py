@@ -122,7 +122,8 @@ def _at_states_of_shorter_step(one: FittedModel, cfg: TimeStepCfg) -> FittedMode
     ]
     if not lost:
         return None
-    finer, plain = _with_time_step(without_defects(one), one.timestep), without_defects(one)
+    plain = without_defects(one)
+    finer = _with_time_step(plain, one.timestep)
     solver, measured = finer.solver(), [np.zeros_like(o) for o in one.fit.offsets]
     there = replace(one.fit, offsets=tuple(measured))
     left, before = ([np.sum(r**2) for r in _projected(one, _residuals(replace(m, fit=there)))] for m in (finer, plain))

@@ -10,6 +10,7 @@ from concent_warp.diagnosis.candidates.evidence import fitted_parameters, indist
 from concent_warp.diagnosis.candidates.fit_candidate import (
     fit_candidate,
     fitted_candidate,
+    multiple_shooting_candidate,
     polish_candidate,
     restart_candidate,
     search_candidate_value,
@@ -26,7 +27,7 @@ from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import BlockCfg, cut_blocks
-from concent_warp.fit.effects.initial_states import InitialStateCfg
+from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
 from concent_warp.fit.effects.observation import ObservationCfg
 from concent_warp.fit.effects.prediction import Prediction
@@ -68,6 +69,26 @@ def test_a_fit_that_is_stuck_at_the_null_value_is_continued_without_fitting_its_
     fit = replace(lacking.fit, values=solver.p.start, linear=linear)
     polished = polish_candidate(lacking, replace(found, fit=fit))
     assert polished.fit.values[0] == pytest.approx(DAMPING, rel=0.05)
+
+
+def test_multiple_shooting_leads_a_stuck_fit_to_the_value_and_samples_no_states(lacking, monkeypatch):
+    found = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    solver = Solver(Prediction(lacking.model, (effect("joint_damping"),), lacking.windows, threads=1))
+    linear = solver.linearise(solver.p.start, lacking.fit.offsets)
+    stuck = replace(found, fit=replace(lacking.fit, values=solver.p.start, linear=linear))
+    recording, searched = swung(), []
+    short = [replace(w, smooth=False) for w in windows_of(recording, length=0.4)]
+    refined = InitialStateSearch.refined
+
+    def noted(self, *args, **settings):
+        if len(self.p.windows) == len(short):
+            searched.append((self.cfg.sample_spreads, self.cfg.restart_samples))
+        return refined(self, *args, **settings)
+
+    monkeypatch.setattr(InitialStateSearch, "refined", noted)
+    there = multiple_shooting_candidate(lacking, stuck, short)
+    assert there.fit.values[0] == pytest.approx(DAMPING, rel=0.05)
+    assert set(searched) == {((), 0)}
 
 
 def test_screening_expects_most_of_the_effect_that_is_missing(lacking):
