@@ -216,8 +216,8 @@ def _end_of_proportion(wild: np.ndarray, most: int) -> int | None:
     """Return where a window ends, by whether differences are out of proportion, shape (T,) bool; None at the end.
 
     A first run of these that is short is passed over, as of one rebound after which a body flies; midway between it and
-    the next one the state is known best, before what follows of that. It is not where the next one begins soon: then
-    contacts are made and broken.
+    the next one the state is known best, before what follows of that. It is not where another short one begins soon:
+    then contacts are made and broken. A long one is no contact, but differences that have grown since the rebound.
 
     Args:
         wild: Whether differences are out of proportion.
@@ -232,8 +232,9 @@ def _end_of_proportion(wild: np.ndarray, most: int) -> int | None:
         return begin
     if len(runs) == 1:
         return None
-    following = runs[1][0]
-    return (end + following) // 2 if following - end >= LEAST_FLIGHT * most else begin
+    following, last = runs[1]
+    broken = last - following <= most and following - end < LEAST_FLIGHT * most
+    return begin if broken else (end + following) // 2
 
 
 def _away(start: np.ndarray, end: np.ndarray, *, turns: bool) -> np.ndarray:

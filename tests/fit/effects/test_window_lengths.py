@@ -181,6 +181,16 @@ def test_a_window_ends_midway_between_two_rebounds_and_at_the_first_of_several_i
     assert reach(Simulated(rebounding), monkeypatch, angle=1e-3) == pytest.approx(expected)
 
 
+def test_a_window_goes_on_after_a_rebound_though_differences_grow_soon_after_it(monkeypatch):
+    def growing(record: np.ndarray) -> np.ndarray:
+        data, time = diverging(0.005)(record), record * 0.005
+        data[1:, (time > 0.395) & (time < 0.445) | (time > 0.605), 0] += 0.1
+        return data
+
+    monkeypatch.setattr(observing, "_may_rebound", lambda _: True)
+    assert reach(Simulated(growing), monkeypatch, angle=1e-3) == pytest.approx(0.53)
+
+
 def test_a_window_ends_where_starts_differ_shortly_before_its_end(monkeypatch):
     def late(record: np.ndarray) -> np.ndarray:
         data = diverging(0.005)(record)
