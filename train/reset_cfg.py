@@ -89,8 +89,9 @@ class ResetCfg:
     approach: float = 3.0
     """In chains, factor minus 1 by which the displacement of the hand is larger at the start of the approach to object
     1 than at its end."""
-    before: Duration = 0.3
-    """Time before the preceding stage from which states are sampled [s]."""
+    before: Annotated[float, Bounds(-1e6, 1e6)] = 0.3
+    """Time before the preceding stage from which states are sampled [s]; a negative one is after its start, where the
+    stage itself begins at the latest."""
     settling_time: Annotated[float, Bounds(0, 3600)] = 0.1
     """Time for which a state is simulated with constant commands before it is accepted [s]."""
     slip: float = 0.003

@@ -17,6 +17,7 @@ from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.environment.physics import MujocoPhysics
 from concent_warp.train.observation_cfg import ObservationCfg
 from concent_warp.train.reset_cfg import ResetCfg
+from concent_warp.train.resets.reset_states import ResetSampler
 from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.task.slots import _select_pairs
 from concent_warp.train.task.task import Task
@@ -136,6 +137,16 @@ def test_states_follow_from_the_seed_and_arms_reach_theirs(sorter):
     np.testing.assert_array_equal(first.qpos, again.qpos)
     assert np.abs(first.qpos - other.qpos).max() > 1e-3
     assert sum(first.discarded.values()) < 20
+
+
+def test_states_are_sampled_from_before_the_preceding_stage_or_from_a_time_after_its_start(sorter):
+    earlier, stage = sorter.events.stages[sorter.stage - 1 : sorter.stage + 1]
+    assert sorter.stage > 0
+    for before, start in ((0.3, earlier.start - 0.3), (1e3, 0.0), (-0.1, earlier.start + 0.1), (-1e3, stage.start)):
+        window = ResetSampler(sorter, ResetCfg(before=before), 0, "cpu").window
+        np.testing.assert_allclose(window, (start, stage.start, stage.event.time))
+    states = sample_reset_states(sorter, ResetCfg(before=-1e3), 0, count=4)
+    assert len(states.qpos) == 4
 
 
 def test_impossible_displacements_are_given_up_with_counts(task):

@@ -98,7 +98,7 @@ class ResetSampler:
         stage = task.events.stages[task.stage]
         self.starts_grasped = task.starts_grasped(task.stage)
         earlier = task.events.stages[task.stage - 1].start if task.stage else 0.0
-        self.window = max(earlier - cfg.before, 0.0), stage.start, stage.event.time
+        self.window = min(max(earlier - cfg.before, 0.0), stage.start), stage.start, stage.event.time
         self.robot_bodies = {e.body for e in task.events.entities if e.role == "robot"}
 
     def free_joint(self, body: int) -> int | None:
