@@ -29,8 +29,8 @@ from concent_warp.diagnosis.candidates.candidates import candidates
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.search.adequacy import least_ratio
-from concent_warp.diagnosis.search.nominal_values import possible_nominal_effects
 from concent_warp.effects.effect import AddedEffect
+from concent_warp.fit.effects.nominal import possible_nominal_effects
 from concent_warp.model import Model
 
 PARTS = {"worn_edge": "edge_x+z-"}

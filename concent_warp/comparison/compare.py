@@ -16,6 +16,7 @@ from concent_warp.comparison.initial_states import with_initial_states
 from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, has_task, phases_by_body, stage_phases
 from concent_warp.comparison.residuals import ResidualCfg, instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
+from concent_warp.comparison.tolerances import ToleranceCfg, tolerance_ranges
 from concent_warp.comparison.worst_spans import WorstSpanCfg, find_worst_spans, rank_worst_spans
 from concent_warp.errors import EventsError, ModelError, RecordingError
 from concent_warp.events.extract_events import extract_events
@@ -52,6 +53,8 @@ class CompareCfg:
     """Settings of the phases of motion."""
     residuals: ResidualCfg = field(default_factory=ResidualCfg)
     """Settings of the residuals."""
+    tolerances: ToleranceCfg = field(default_factory=ToleranceCfg)
+    """Settings of what ordinary errors of nominal values would leave."""
     worst_spans: WorstSpanCfg = field(default_factory=WorstSpanCfg)
     """Settings of the search for spans of large error."""
 
@@ -120,6 +123,7 @@ def compare(
         motion_cfg=cfg.motion_phases,
         residual_cfg=cfg.residuals,
         span_cfg=cfg.worst_spans,
+        tolerance_cfg=cfg.tolerances,
         progress=progress,
     )
     found = replace(found, events=events or {}, remarks=remarks)
@@ -140,6 +144,7 @@ def compare_replays(
     motion_cfg: MotionPhaseCfg | None = None,
     residual_cfg: ResidualCfg | None = None,
     span_cfg: WorstSpanCfg | None = None,
+    tolerance_cfg: ToleranceCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Replay demonstrations in each model and compare what it predicts with what was measured.
@@ -159,6 +164,8 @@ def compare_replays(
         motion_cfg: Settings of the phases of motion.
         residual_cfg: Settings of the residuals.
         span_cfg: Settings of the search for spans of large error.
+        tolerance_cfg: Settings of what ordinary errors of the last model's nominal values would leave; None to leave
+            that out.
         progress: Called with the share done, 0..1.
 
     Raises:
@@ -172,12 +179,13 @@ def compare_replays(
     span_cfg = span_cfg or WorstSpanCfg()
     found, diverged, partners = {}, {}, {}
     moving: dict[str, dict[str | None, tuple[Phase, ...]]] = {}
-    last = tuple(models)[-1]
+    last, tolerances = tuple(models)[-1], {}
     for name, model in models.items():
         simulator = make_engine(engine, model)
         compiled = model.compile()
         noise = instrument_noise(compiled, recording.demonstrations)
-        for d in with_initial_states(model, replace(recording, demonstrations=chosen), engine).demonstrations:
+        begun = with_initial_states(model, replace(recording, demonstrations=chosen), engine).demonstrations
+        for d in begun:
             rollout = replay(model, d, simulator, contacts="all" if name == last else "none").numpy()
             found[name, d.name] = residuals(compiled, rollout, d, noise, model.effects, residual_cfg)
             if rollout.diverged[0]:
@@ -189,6 +197,9 @@ def compare_replays(
                 moving[d.name] = phases_by_body(model, compiled, rollout, motion_cfg, ctrl)
             if progress is not None:
                 progress(len(found) / (len(models) * len(chosen)))
+        if name == last and tolerance_cfg is not None:
+            mine = {d.name: found[last, d.name] for d in begun}
+            tolerances = tolerance_ranges(model, begun, mine, noise, engine, tolerance_cfg, residual_cfg, seed)
     if not any(found.values()):
         raise RecordingError("nothing was measured that could be compared with a model", where=recording.source)
     staged = phases or {}
@@ -213,6 +224,7 @@ def compare_replays(
         seed=seed,
         bootstrap=bootstrap or BootstrapCfg(),
         worst_spans=rank_worst_spans(worst, span_cfg),
+        tolerances=tolerances,
         span_cfg=span_cfg,
         staged=phases is not None,
     )

@@ -13,6 +13,7 @@ from concent_warp.comparison.bootstrap import BootstrapCfg, effective_count, mea
 from concent_warp.comparison.html import comparison_html
 from concent_warp.comparison.phases import FREE, Phase
 from concent_warp.comparison.residuals import Residual
+from concent_warp.comparison.tolerances import ToleranceRange, tolerance_sentences
 from concent_warp.comparison.units import ratio_text, unit_text, value_text
 from concent_warp.comparison.worst_spans import WorstSpan, WorstSpanCfg
 from concent_warp.errors import ModelError, RecordingError
@@ -113,6 +114,9 @@ class Comparison:
     """Whether the phases are contact stages; else they are phases of motion."""
     events: Mapping[str, ContactEventSequence] = field(default_factory=dict)
     """Contact event sequences of the last model, by demonstration, where they were extracted."""
+    tolerances: Mapping[str, ToleranceRange] = field(default_factory=dict)
+    """What ordinary errors of the last model's nominal values alone would leave, by channel; empty where that was not
+    asked (`ToleranceCfg`)."""
     remarks: tuple[str, ...] = ()
     """What to know about the comparison, a sentence each."""
 
@@ -245,6 +249,13 @@ class Comparison:
                 return channels[int(np.argmax(np.nan_to_num(errors, nan=-1, posinf=np.finfo(float).max)))]
         raise RecordingError("nothing was measured that could be compared with a model")
 
+    def tolerance_sentences(self) -> list[str]:
+        """Return sentences on what ordinary errors of the last model's nominal values alone would leave; none where
+        that was not asked.
+        """
+        ratios = {channel: self.summarise(self.after, channel).ratio for channel in self.tolerances}
+        return tolerance_sentences(self.tolerances, {c: ratio for c, ratio in ratios.items() if ratio is not None})
+
     def rows(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield what a table shows: each channel over all times, then by phase."""
         for channel in self.channels:
@@ -266,12 +277,14 @@ class Comparison:
             "headline": {
                 "channel": main[0],
                 "phases": list(main[1]),
+                "tolerances": {channel: asdict(found) for channel, found in self.tolerances.items()},
                 "summaries": [asdict(self.summarise(m, *main)) for m in self.models],
                 "difference": self._difference_json(*main),
             },
             "worst_spans": [
                 {**asdict(span), "sentence": span.sentence(demonstration=True)} for span in self.worst_spans
             ],
+            "tolerances": {channel: asdict(found) for channel, found in self.tolerances.items()},
             "summaries": [asdict(self.summarise(m, c, p)) for c, p in rows for m in self.models],
             "differences": [d for c, p in rows if (d := self._difference_json(c, p))],
             "interval": {"level": self.bootstrap.level, "rule": self.bootstrap.rule, "seed": self.seed},
@@ -291,7 +304,8 @@ class Comparison:
             row += ["-" if summary.ratio is None else ratio_text(summary.ratio) for summary in found]
             rows.append(row + ([self.difference(channel).verdict] if len(models) > 1 else []))
         spans = self.worst_spans[: self.span_cfg.max_shown]
-        return comparison_html(header, rows, [span.sentence(demonstration=True) for span in spans])
+        notes = self.tolerance_sentences()
+        return comparison_html(header, rows, notes, [span.sentence(demonstration=True) for span in spans])
 
     def _difference_json(self, channel: str, phases: tuple[str, ...]) -> dict[str, Any] | None:
         if len(self.models) < 2:

@@ -108,7 +108,7 @@ def write_report(
         "tables_about": escape(
             f"Mean error over time with its 95 % interval ({comparison.bootstrap.rule}); RMS, 95th percentile, largest "
             f"error, noise floor (RMS) and RMS error over it (x noise) of “{comparison.after}”. Green and red changes "
-            "are those whose interval excludes 0."
+            f"are those whose interval excludes 0. {' '.join(comparison.tolerance_sentences())}"
         ),
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),

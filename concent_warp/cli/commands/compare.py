@@ -71,10 +71,13 @@ def run(arguments: Arguments) -> Comparison:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     elif arguments.markdown:
         print(markdown_table(found, every_phase=arguments.every_phase), end="")
+        print("".join(f"\n{sentence}" for sentence in found.tolerance_sentences()))
         print("".join(f"\n{i + 1}. {text}" for i, text in enumerate(_place_lines(found, arguments.places))))
     else:
         say(rich_table(found, every_phase=arguments.every_phase, width=table_width()))
         _say_noise(found)
+        for sentence in found.tolerance_sentences():
+            say(escape(sentence))
         _say_places(found, arguments.places)
         say_diverged(found)
     if arguments.html is not None:

@@ -15,11 +15,12 @@ from scipy.optimize import lsq_linear
 
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.nominal_values import NominalSensitivities, possible_nominal_effects
+from concent_warp.diagnosis.search.nominal_values import NominalSensitivities
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.nominal import BOUND
 from concent_warp.fit.effects.cross_validation import Sums, block_sums
 from concent_warp.fit.effects.least_squares import Linear
+from concent_warp.fit.effects.nominal import possible_nominal_effects
 from concent_warp.model import Model
 
 MIN_ROOM = 1e-6

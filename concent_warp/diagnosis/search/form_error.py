@@ -19,7 +19,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.adequacy import channel_residuals
-from concent_warp.diagnosis.search.nominal_values import nominal_sensitivities, possible_nominal_effects
+from concent_warp.diagnosis.search.nominal_values import nominal_sensitivities
 from concent_warp.diagnosis.search.unknown_force import (
     Results,
     combined,
@@ -32,6 +32,7 @@ from concent_warp.effects.effect import Effect, Variable
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.library.nominal import FRICTION_TOLERANCE, NominalFriction
 from concent_warp.effects.unknown_force import UnknownJointForce
+from concent_warp.fit.effects.nominal import possible_nominal_effects
 from concent_warp.fit.effects.robust import robust_noise_ratio
 
 

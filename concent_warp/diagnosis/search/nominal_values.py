@@ -11,9 +11,9 @@ from concent_warp.diagnosis.candidates.baseline import fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg
 from concent_warp.effects.effect import AddedEffect, Effect
-from concent_warp.effects.registry import NOMINAL
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
+from concent_warp.fit.effects.nominal import possible_nominal_effects
 from concent_warp.fit.effects.robust import huber_weight
 from concent_warp.model import Model
 
@@ -184,17 +184,6 @@ def considered_std(j: np.ndarray, k: np.ndarray, excess: float, prior: float) ->
     left = k + j @ move
     within = np.linalg.inv(np.eye(k.shape[1]) + left.T @ left / (len(left) * excess))
     return np.sqrt(np.maximum(np.diag(move @ within @ move.T), 0.0))
-
-
-def possible_nominal_effects(model: Model) -> list[Effect]:
-    """Return all nominal values of a model as effects, less those that an effect of the model is."""
-    compiled, found = model.compile(), []
-    for kind in NOMINAL:
-        taken = {t for a in model.effects if kind.is_within(a.effect) for t in a.effect.target}
-        for targets in kind.targets(compiled):
-            if names := [t for t in targets if t not in taken]:
-                found.append(kind(*names))
-    return found
 
 
 def _sensitivities(base: FittedModel, kinds: Sequence[Effect]) -> list[np.ndarray]:

@@ -15,7 +15,6 @@ import numpy as np
 
 from concent_warp.diagnosis.diagnose import DIAGNOSIS_FILE
 from concent_warp.diagnosis.result import Diagnosis
-from concent_warp.diagnosis.search.nominal_values import possible_nominal_effects
 from concent_warp.diagnosis.suggestion.cfg import SuggestCfg
 from concent_warp.documents import is_number, read_json
 from concent_warp.effects.effect import AddedEffect, with_unit
@@ -23,6 +22,7 @@ from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.fit.effects.intervals import NORMAL_QUANTILE
+from concent_warp.fit.effects.nominal import possible_nominal_effects
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName

@@ -22,7 +22,6 @@ from concent_warp.diagnosis.search.nominal_values import (
     considered_std,
     nominal_errors,
     nominal_sensitivities,
-    possible_nominal_effects,
     stays_within,
     with_nominal_values,
 )
@@ -30,6 +29,7 @@ from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums, cut_blocks
 from concent_warp.fit.effects.least_squares import Solver
+from concent_warp.fit.effects.nominal import possible_nominal_effects
 from tests.scenes.foreign import PUSHER, pusher
 from tests.scenes.swinging import drawing, swung, windows_of
 
