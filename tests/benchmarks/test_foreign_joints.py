@@ -62,7 +62,12 @@ def both(machine: Machine) -> list[tuple[str, np.ndarray, np.ndarray]]:
 
 @pytest.mark.parametrize(
     "machine",
-    [double_pendulum.MACHINE, yaw_arm.MACHINE, corexy.MACHINE, six_axis.MACHINE],
+    [
+        double_pendulum.MACHINE,
+        yaw_arm.MACHINE,
+        corexy.MACHINE,
+        pytest.param(six_axis.MACHINE, marks=pytest.mark.slow),
+    ],
     ids=lambda machine: machine.name,
 )
 def test_without_friction_the_equations_agree_with_the_model_in_the_log_to_half_a_milliradian(machine):

@@ -31,8 +31,12 @@ def diagnosed(data, case, effects=()):
 @pytest.mark.parametrize(
     ("name", "effects", "above"),
     # Over the short windows of a free body, errors of the initial states hide most of a wrong scale.
-    [("pendulum-joint_friction-middle-0", (), 1.5), ("drop-length_scale-middle-0", RIVALS, 1.1)],
-    ids=["friction among all effects", "scale of lengths among its rivals"],
+    [
+        pytest.param("pendulum-joint_friction-middle-0", (), 1.5, id="friction among all effects"),
+        pytest.param(
+            "drop-length_scale-middle-0", RIVALS, 1.1, id="scale of lengths among its rivals", marks=pytest.mark.slow
+        ),
+    ],
 )
 def test_the_hidden_effect_is_named_first_with_its_value(data, name, effects, above):
     (truth,), found = diagnosed(data, named(data, name), effects)

@@ -216,9 +216,9 @@ def test_a_ball_rebounds_alike_from_every_height_on_the_plane(script):
     ("name", "most"),
     [
         ("pendulum-joint_friction-middle", 4.0),
-        ("pendulum-backlash-large", 6.0),
+        pytest.param("pendulum-backlash-large", 6.0, marks=pytest.mark.slow),
         ("slide-gravity_tilt-large", 2.0),
-        ("tumble-inertia-large", 2.0),
+        pytest.param("tumble-inertia-large", 2.0, marks=pytest.mark.slow),
     ],
 )
 def test_truth_explains_the_data_but_not_exactly(script, worlds, monkeypatch, name, most):

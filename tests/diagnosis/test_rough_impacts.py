@@ -6,6 +6,7 @@ from functools import cache
 
 import mujoco
 import numpy as np
+import pytest
 
 import concent_warp as cw
 from concent_warp.diagnosis.cfg import SearchCfg
@@ -99,6 +100,7 @@ def diagnosed(recording: Recording, effects: tuple[str, ...], search: SearchCfg 
     return cw.diagnose(cw.Model.from_recording(recording), recording, cfg)
 
 
+@pytest.mark.slow
 def test_drag_is_found_beside_rebounds_that_no_law_foretells():
     found = diagnosed(throws(DRAG, 0.01), CANDIDATES)
     assert found.verdict == "effect"
