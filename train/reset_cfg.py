@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from concent_warp.checks import Bounds, Count, Duration, Positive, Share
+from concent_warp.checks import Bounds, Count, Duration, Positive, Share, Signed
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class ResetCfg:
     approach: float = 3.0
     """In chains, factor minus 1 by which the displacement of the hand is larger at the start of the approach to object
     1 than at its end."""
-    before: Annotated[float, Bounds(-1e6, 1e6)] = 0.3
+    before: Signed = 0.3
     """Time before the preceding stage from which states are sampled [s]; a negative one is after its start, where the
     stage itself begins at the latest."""
     settling_time: Annotated[float, Bounds(0, 3600)] = 0.1

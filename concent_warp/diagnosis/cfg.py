@@ -266,10 +266,11 @@ class TimeStepCfg:
     max_renewals: Count = 5
     """Most times that what a shorter step changes is computed again about the fit to it, until it changes by less than
     `max_error`."""
-    least_shrinking: Share = 0.7
-    """Share of the change before, above which such a change does not count as shrinking, and of what the model's own
-    step leaves at measured states, above which a shorter one is not at fault that fitted states are far from them [-].
-    Empirical."""
+    max_change_left: Share = 0.7
+    """Share of the change before, above which such a change does not count as shrinking [-]. Empirical."""
+    max_misfit_left: Share = 0.7
+    """Share of what the model's own step leaves at measured states, above which a shorter one leaves too much there for
+    the step to be why fitted states are far from them [-]. Empirical."""
     max_error_left: Positive = 1.0
     """Error over the noise that a shorter step may still have, above which nothing is said to be missing that may be
     this error [-]: the noise itself."""

@@ -26,7 +26,7 @@ from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.replayed import Replayed, replayed
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio, qualified_by_noise
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, is_near_noise, qualified_by_noise
 from concent_warp.diagnosis.search.alternatives import try_alternatives
 from concent_warp.diagnosis.search.consistency import beyond_effects
 from concent_warp.diagnosis.search.context import (
@@ -160,8 +160,8 @@ class Procedure:
         if explained and stands:
             enough &= count == 1
         elif explained:
-            ratio = least_ratio(beside[-1], context.noise_factors)
-            enough &= count < len(settled.accepted()) and ratio <= context.cfg.search.explained_ratio
+            enough &= count < len(settled.accepted())
+            enough &= is_near_noise(beside[-1], context.noise_factors, context.cfg)
         if enough and not budget.cut:
             self.impacts_left = True
             return rough, beside, smallest
@@ -180,7 +180,7 @@ class Procedure:
         One of contacts themselves does not count: errors of impacts are about these.
         """
         context, accepted = self.context, self.record.accepted()
-        quiet = least_ratio(given, context.noise_factors) <= context.cfg.search.explained_ratio
+        quiet = is_near_noise(given, context.noise_factors, context.cfg)
         little = len(accepted) == 1 and accepted[0].gain < context.cfg.quiet_min_gain
         return quiet and little and accepted[0].family != "contact"
 
@@ -198,10 +198,10 @@ class Procedure:
             rough: The model as given where errors of impacts count as noise.
         """
         context, accepted = self.context, self.record.accepted()
-        near_noise = least_ratio(fitted[-1], context.noise_factors) <= context.cfg.search.explained_ratio
+        near_noise = is_near_noise(fitted[-1], context.noise_factors, context.cfg)
         plain = near_noise and all(f.family != "objects" for f in accepted)
-        least, most = (least_ratio(one, context.noise_factors) for one in (rough, given))
-        alone = least <= context.cfg.search.explained_ratio < most
+        alone = is_near_noise(rough, context.noise_factors, context.cfg)
+        alone &= not is_near_noise(given, context.noise_factors, context.cfg)
         doubtful = self._is_small(given) or (alone and accepted[0].family != "contact")
         if len(accepted) == 1 and plain and not doubtful:
             return True

@@ -212,7 +212,7 @@ def test_an_effect_beside_little_more_than_noise_is_not_settled_without_what_els
     cfg = replace(CFG, search=replace(CFG.search, doubtful_gain=1.1))
     if quiet:
         for one in (additions, find_addition):
-            monkeypatch.setattr(one, "least_ratio", lambda *_: 1.0)
+            monkeypatch.setattr(one, "is_near_noise", lambda *_: True)
     assert diagnose(drawing(recording), recording, cfg).verdict == "effect"
 
     def no_time(*_args):

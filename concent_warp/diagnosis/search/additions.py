@@ -16,7 +16,7 @@ from concent_warp.diagnosis.candidates.baseline import add_candidate, errors_lik
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.candidates.evidence import largest_size, leaves_more
 from concent_warp.diagnosis.result import Detectable
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, least_ratio
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, is_near_noise
 from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
@@ -164,7 +164,7 @@ class Additions:
 
     def _is_quiet(self, one: FittedModel) -> bool:
         """Return whether a model leaves little more than noise."""
-        return least_ratio(one, self.context.noise_factors) <= self.context.cfg.search.explained_ratio
+        return is_near_noise(one, self.context.noise_factors, self.context.cfg)
 
     def _is_unsettled_remainder(self, one: FittedModel, first: FittedModel, step: int) -> bool:
         """Return whether a model leaves no more than errors in formulas, and the search for a further effect was cut.

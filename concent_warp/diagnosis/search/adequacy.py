@@ -46,6 +46,17 @@ def least_ratio(base: FittedModel, noise_factors: Mapping[str, float]) -> float:
     return robust_noise_ratio(_scaled(base, noise_factors), base.cfg.least_squares.robust)
 
 
+def is_near_noise(base: FittedModel, noise_factors: Mapping[str, float], cfg: DiagnoseCfg) -> bool:
+    """Return whether a fitted model leaves little more than noise, see `SearchCfg.explained_ratio`.
+
+    Args:
+        base: The fitted model.
+        noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
+        cfg: Settings.
+    """
+    return least_ratio(base, noise_factors) <= cfg.search.explained_ratio
+
+
 def hidden_by_noise(base: FittedModel, noises: Mapping[str, Noise], cfg: DiagnoseCfg) -> str | None:
     """Return a sentence where what a model explains down to the noise is well above the least noise that may be.
 

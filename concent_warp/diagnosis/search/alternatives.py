@@ -18,7 +18,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.evidence import leaves_more, surprise
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.adequacy import discrepancies, least_ratio
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_near_noise
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.diagnosis.search.record import SearchRecord
@@ -88,7 +88,7 @@ def _most(cfg: SearchCfg) -> int:
 
 def _reaches_noise(context: SearchContext, one: FittedModel) -> bool:
     """Return whether a fitted model leaves little more than noise: no other effects could explain more then."""
-    return least_ratio(one, context.noise_factors) <= context.cfg.search.explained_ratio
+    return is_near_noise(one, context.noise_factors, context.cfg)
 
 
 def log_odds(other: FittedModel, best: FittedModel, first: FittedModel | None, cfg: DiagnoseCfg) -> float:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, least_ratio
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_near_noise
 from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.nominal_values import (
     nominal_effects,
@@ -115,8 +115,7 @@ class SearchContext:
         adequate = is_adequate(one, self.noise_factors, self.cfg)
         if not added:
             return adequate
-        little = least_ratio(one, self.noise_factors) <= self.cfg.search.explained_ratio
-        return (adequate and little) or self.is_form_error(one, first)
+        return (adequate and is_near_noise(one, self.noise_factors, self.cfg)) or self.is_form_error(one, first)
 
     def is_far_off(self, one: FittedModel, first: FittedModel) -> bool:
         """Return whether a model with added effects leaves far more than noise, and much of the discrepancy.
@@ -140,7 +139,7 @@ class SearchContext:
             last: The fitted model with all of them.
         """
         gains = [f.gain for f in self.record.accepted()]
-        if len(gains) < 2 or least_ratio(last, self.noise_factors) <= self.cfg.search.explained_ratio:
+        if len(gains) < 2 or is_near_noise(last, self.noise_factors, self.cfg):
             return False
         without = last.ratio**2 / max(1 - min(gains), 1e-12)
         return last.ratio**2 - 1 > self.cfg.max_remainder * (without - 1)

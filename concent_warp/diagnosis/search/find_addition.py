@@ -31,7 +31,7 @@ from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_n
 from concent_warp.diagnosis.candidates.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Detectable, Finding
-from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
+from concent_warp.diagnosis.search.adequacy import is_adequate, is_near_noise, least_ratio
 from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
 from concent_warp.diagnosis.search.joint_fit import established_effects, joint_parameters
@@ -91,7 +91,7 @@ class AdditionFinder:
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
-        quiet = least_ratio(base, context.noise_factors) <= cfg.search.explained_ratio
+        quiet = is_near_noise(base, context.noise_factors, cfg)
         doubted = step if quiet else None
         small = quiet and explained and step == 0 and self._is_as_given(base)
         if quiet:

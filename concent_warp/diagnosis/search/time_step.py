@@ -101,7 +101,7 @@ def renew_defects(one: FittedModel, cfg: TimeStepCfg) -> FittedModel:
             np.concatenate([_defect(a) - _defect(b) for a, b in zip(renewed.windows, one.windows, strict=True)])
         )
         one = refitted(renewed)
-        if change < cfg.max_error or change > cfg.least_shrinking * least:
+        if change < cfg.max_error or change > cfg.max_change_left * least:
             break
         least = change
     return one
@@ -127,7 +127,7 @@ def _at_states_of_shorter_step(one: FittedModel, cfg: TimeStepCfg) -> FittedMode
     solver, measured = finer.solver(), [np.zeros_like(o) for o in one.fit.offsets]
     there = replace(one.fit, offsets=tuple(measured))
     left, before = ([np.sum(r**2) for r in _projected(one, _residuals(replace(m, fit=there)))] for m in (finer, plain))
-    lost = [w for w in lost if left[w] < cfg.least_shrinking * before[w]]
+    lost = [w for w in lost if left[w] < cfg.max_misfit_left * before[w]]
     if not lost:
         return None
     iterations = one.cfg.least_squares.initial_states.iterations

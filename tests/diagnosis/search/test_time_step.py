@@ -248,7 +248,7 @@ def test_states_far_off_are_fitted_by_simulations_with_the_shorter_step():
     near = replace(lost, fit=replace(one.fit, offsets=(*spoiled[:1], np.full(2, least), *spoiled[2:])))
     assert module._at_states_of_shorter_step(near, TimeStepCfg()) is None
     # At the measured states the shorter step leaves a small part of what the long one does, but not none.
-    assert module._at_states_of_shorter_step(lost, TimeStepCfg(least_shrinking=0.0)) is None
+    assert module._at_states_of_shorter_step(lost, TimeStepCfg(max_misfit_left=0.0)) is None
 
 
 @pytest.mark.parametrize(
