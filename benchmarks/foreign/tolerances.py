@@ -22,7 +22,7 @@ from joblib import Parallel, delayed
 
 from benchmarks.foreign.cases import all_cases
 from benchmarks.foreign.log import Case
-from benchmarks.foreign.scoring import KINDS, TITLES
+from benchmarks.foreign.scoring import KINDS
 from benchmarks.foreign.study import described
 from benchmarks.independent.study import path
 from benchmarks.pages import machine, machine_line, table, write_data, write_page
@@ -34,13 +34,19 @@ from concent_warp.recording.load import load_recording
 
 NAME = "tolerances"
 ABOUT = """
-`python -m benchmarks.foreign.tolerances --jobs 2` compares the model of each [foreign log](foreign.md) with the log, as
-`concent compare` does, and counts what it says: that the model leaves more than [ordinary
+`python -m benchmarks.foreign.tolerances --jobs 31` compares the model of each [foreign log](foreign.md) with the log,
+as `concent compare` does, and counts what it says: that the model leaves more than [ordinary
 tolerances](../compare.md) of its nominal values would alone, in at least one channel, or no more, or so little that it
 is not asked. Where nothing is hidden, masses, lengths and gains of these logs are off by 0.3 to 2 %, friction and
 damping by up to 4 %. No setting was chosen by looking at these logs. What a small effect leaves may be no more than
 tolerances do: `concent diagnose` fits nominal values, and finds some of these.
 """
+HIDDEN = {
+    "null": "nothing hidden",
+    "single": "one effect",
+    "pair": "two effects",
+    "outside": "a cause that the library lacks",
+}
 OTHERWISE = "Something is hidden and the model leaves no more than tolerances, or nothing is and it leaves more."
 
 
@@ -69,9 +75,13 @@ def main(args: Args) -> None:
     if args.names:
         return
     rows = [json.loads(path(args.out, case.name).read_text()) for case in cases]
-    facts = machine()
-    write_data(NAME, {"machine": facts, "rows": rows})
-    write_page(NAME, page(rows, machine_line(facts)))
+    write({"machine": machine(), "rows": rows})
+
+
+def write(data: dict[str, Any]) -> None:
+    """Write the page and its data: the machine, and a row a log."""
+    write_data(NAME, data)
+    write_page(NAME, page(data["rows"], machine_line(data["machine"])))
 
 
 def keep(out: Path, case: Case) -> str:
@@ -118,7 +128,7 @@ def page(rows: Sequence[dict[str, Any]], host: str) -> str:
         for locked in (False, True):
             part = [r for r in rows if r["kind"] == kind and r["locked"] == locked]
             counts = [str(sum(said(r) == answer for r in part)) for answer in answers]
-            lines.append([f"{TITLES[kind]}, {'locked' if locked else 'development'} machines", str(len(part)), *counts])
+            lines.append([f"{HIDDEN[kind]}, {'locked' if locked else 'development'} machines", str(len(part)), *counts])
     seconds = [r["seconds"] for r in rows if "seconds" in r]
     times = f"Processor time of a comparison: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s."
     head = ["", "logs", *(titles[answer] for answer in answers)]
