@@ -108,7 +108,7 @@ def write_report(
         "tables_about": escape(
             f"Mean error over time with its 95 % interval ({comparison.bootstrap.rule}); RMS, 95th percentile, largest "
             f"error, noise floor (RMS) and RMS error over it (x noise) of “{comparison.after}”. Green and red changes "
-            f"are those whose interval excludes 0. {' '.join(comparison.tolerance_sentences())}"
+            "are those whose interval excludes 0."
         ),
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),
@@ -136,7 +136,9 @@ def _worst_spans_section(comparison: Comparison, shown: Sequence[str]) -> str:
         f"Every channel over time, coloured by its error over the measurement noise.{strips} Bands are "
         f"{_bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
     )
-    return filled(page_file("worst_spans.html"), {"about": escape(about), "places": worst_span_list(comparison, shown)})
+    said = " ".join(comparison.tolerance_sentences())
+    places = worst_span_list(comparison, shown) + (f"<p>{escape(said)}</p>" if said else "")
+    return filled(page_file("worst_spans.html"), {"about": escape(about), "places": places})
 
 
 def _bands(comparison: Comparison) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from concent_warp.comparison.compare import compare_replays
+from concent_warp.comparison.tolerances import ToleranceRange
 from concent_warp.comparison.units import value_text
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -74,6 +75,17 @@ def test_data_cannot_end_the_script_that_it_stands_in(case, tmp_path):
     write_report(path, case.recording, compare_replays(models, case.recording, "mujoco"))
     assert "m</script>" not in path.read_text()
     assert embedded(path)["models"][0]["name"] == "m</script>"
+
+
+def test_the_page_says_what_ordinary_tolerances_would_leave(case, text, tmp_path):
+    channel = case.comparison.channels[0]
+    beside = replace(case.comparison, tolerances={channel: ToleranceRange(1.2, 3.4)})
+    write_report(tmp_path / "r.html", case.recording, beside)
+    page = (tmp_path / "r.html").read_text()
+    for sentence in beside.tolerance_sentences():
+        assert escape(sentence) in page
+    assert "1.2 to 3.4 x noise" in page
+    assert "Nominal values within" not in text
 
 
 def test_the_cards_show_the_errors_of_fitted_and_unseen_demonstrations(case, text):
