@@ -8,7 +8,7 @@ from a few replays of models whose nominal values are all drawn from their toler
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from concent_warp.checks import Bounds, Count, Factor
 from concent_warp.comparison.residuals import Residual, ResidualCfg, residuals
 from concent_warp.comparison.units import channel_text, ratio_text
+from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.nominal import CLOCK_TOLERANCE, FRICTION_TOLERANCE, PRIOR_SCALES, TOLERANCE
 from concent_warp.estimation.noise import Noise
 from concent_warp.estimation.noise_ratio import noise_ratio
@@ -82,14 +83,14 @@ def tolerance_ranges(
     if draws < 2 or not kinds or _largest_ratio(found) < cfg.min_ratio:
         return {}
     rng, plain = np.random.default_rng(seed), model.compile()
+    bounds = [np.array([[p.low, p.null, p.high, p.scale] for p in kind.parameters(plain)]).T for kind in kinds]
     ratios: dict[str, list[float]] = {}
     for _ in range(draws):
-        other = model
-        for kind in kinds:
-            parameters = kind.parameters(plain)
-            low, null, high = np.array([[p.low, p.null, p.high] for p in parameters]).T
-            spread = PRIOR_SCALES * np.array([p.scale for p in parameters])
-            other = other.add(kind, np.clip(rng.normal(null, spread), low, high).tolist())
+        drawn = (
+            AddedEffect(kind, tuple(np.clip(rng.normal(null, PRIOR_SCALES * scale), low, high).tolist()))
+            for kind, (low, null, high, scale) in zip(kinds, bounds, strict=True)
+        )
+        other = replace(model, effects=(*model.effects, *drawn))
         for channel, ratio in _changes(other, demonstrations, found, noise, engine, residual_cfg).items():
             ratios.setdefault(channel, []).append(float(np.hypot(1.0, ratio)))
     return {channel: ToleranceRange(min(of), max(of)) for channel, of in ratios.items()}
