@@ -254,7 +254,9 @@ class Comparison:
         that was not asked.
         """
         ratios = {channel: self.summarise(self.after, channel).ratio for channel in self.tolerances}
-        return tolerance_sentences(self.tolerances, {c: ratio for c, ratio in ratios.items() if ratio is not None})
+        return tolerance_sentences(
+            self.tolerances, {c: r for c, r in ratios.items() if r is not None and not np.isnan(r)}
+        )
 
     def rows(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield what a table shows: each channel over all times, then by phase."""

@@ -50,6 +50,12 @@ class ToleranceRange:
     high: float
     """The same of the worst draw; infinite where a replay diverges."""
 
+    @property
+    def text(self) -> str:
+        """The range in words, such as ``1.2 to 8.0 x``."""
+        low, high = f"{self.low:.1f}", ratio_text(self.high)
+        return f"{low} to {high}" if np.isfinite(self.low) else high
+
 
 def tolerance_ranges(
     model: Model,
@@ -107,9 +113,7 @@ def tolerance_sentences(ranges: Mapping[str, ToleranceRange], left: Mapping[str,
     named = sorted((c for c in ranges if c in left), key=lambda c: -left[c])
     if not named:
         return []
-    shown = ", ".join(
-        f"{channel_text(c)} {ranges[c].low:.1f} to {ratio_text(ranges[c].high)} noise" for c in named[:most]
-    )
+    shown = ", ".join(f"{channel_text(c)} {ranges[c].text} noise" for c in named[:most])
     sentences = [
         f"Nominal values within ordinary tolerances ({100 * TOLERANCE:g} %, friction and damping of joints "
         f"{100 * FRICTION_TOLERANCE:g} %, latencies {1e3 * CLOCK_TOLERANCE:g} ms) would alone leave: {shown}."
@@ -147,8 +151,9 @@ def _changes(
         rollout = replay(other, d, simulator).numpy()
         changed = residuals(compiled, rollout, d, noise, other.effects, residual_cfg)
         for before, after in zip(found[d.name], changed, strict=True):
-            if before.noise:
-                there = np.isfinite(before.error)
-                away = np.linalg.norm(np.nan_to_num(after.value - before.value, posinf=np.inf), axis=1)
+            there = np.isfinite(before.error)
+            if before.noise and there.any():
+                away = np.linalg.norm(np.nan_to_num(after.value - before.value), axis=1)
+                away[np.isinf(after.error)] = np.inf
                 changes.setdefault(before.channel, []).append(away[there] / before.noise)
     return {channel: noise_ratio(np.concatenate(of)) for channel, of in changes.items()}

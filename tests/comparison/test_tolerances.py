@@ -7,7 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from concent_warp.comparison import tolerances
 from concent_warp.comparison.compare import CompareCfg, compare
+from concent_warp.comparison.residuals import residuals
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.tolerances import ToleranceCfg, ToleranceRange, tolerance_sentences
 from concent_warp.model import Model
@@ -107,6 +109,28 @@ def test_ranges_are_in_json_and_in_notebooks():
     assert found.tolerance_sentences()[1] in found._repr_html_()
     lost = replace(found, tolerances={"height": ToleranceRange(1.0, np.inf)})
     assert json.loads(json.dumps(lost.to_json(), allow_nan=False))["tolerances"]["height"]["high"] is None
+
+
+def test_a_replay_that_diverges_counts_as_far_off_and_what_was_never_measured_not_at_all(monkeypatch):
+    recording = recorded(1.01)
+    (d,) = recording.demonstrations
+    height = d.measured["height"]
+    unseen = replace(height, value=np.full_like(height.value, np.nan))
+    partly = replace(recording, demonstrations=(d, replace(d, name="demo_1", measured={"height": unseen})))
+    assert np.isfinite(compared(partly).tolerances["height"].high)
+
+    def lost(*arguments):
+        (found,) = residuals(*arguments)
+        error = found.error.copy()
+        error[-3:] = np.inf
+        value = found.value.copy()
+        value[-3:] = np.nan
+        return (replace(found, error=error, value=value),)
+
+    monkeypatch.setattr(tolerances, "residuals", lost)
+    found = compared(recording)
+    assert found.tolerances["height"] == ToleranceRange(np.inf, np.inf)
+    assert "leave: height over 1000 x noise" in found.tolerance_sentences()[0]
 
 
 def test_three_channels_are_named_those_that_leave_most_first():
