@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.contact_state import BodyWindows
@@ -179,7 +179,7 @@ def steady_force(w: Wrenches, cfg: LocateForcesCfg) -> SteadyForce | None:
         highest = np.max(statistics, axis=0)
         p = float((highest >= highest[0] * (1 - 1e-12)).mean())
     else:
-        p = float(min(1.0, len(fits) * min(chi2.sf(f[0] / scale**2, f[4]) for f in fits.values())))
+        p = float(min(1.0, len(fits) * min(chdtrc(f[4], f[0] / scale**2) for f in fits.values())))
     steady = np.einsum("nij,j->ni", basis, vector)
     # Scatter beyond the noise counts where it is significant: 3 standard errors of a mean square.
     excess = (

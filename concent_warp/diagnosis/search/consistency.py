@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from concent_warp.diagnosis.candidates.baseline import fit_baseline
 from concent_warp.diagnosis.candidates.candidate import FittedModel
@@ -159,6 +159,6 @@ def variation(one: FittedModel, effect: int, cfg: DiagnoseCfg) -> Variation:
     freedom, noise = ranks[0] - ranks[1], max(1.0, one.ratio / one.noise_scale) ** 2
     seen = float(fall(slope.sum(axis=0)))
     signs = np.random.default_rng(cfg.seed).choice([-1.0, 1.0], size=(cfg.null_samples, one.blocks.count))
-    p = max(float(chi2.sf(seen / noise, max(freedom, 1))), null_p_value(fall(signs @ slope), seen))
+    p = max(float(chdtrc(max(freedom, 1), seen / noise)), null_p_value(fall(signs @ slope), seen))
     excess = max(seen - noise * freedom, 0.0)
     return Variation(excess, excess / max(float(sums.square.sum()), 1e-12), p)

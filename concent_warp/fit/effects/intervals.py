@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr, ndtri
-from scipy.stats import t as student
+from scipy.special import ndtr, ndtri, stdtrit
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.posterior import JointPosterior
@@ -154,7 +153,7 @@ def clustered_std(sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.pri
         added += 2 * (1 - k / (lags + 1)) * (scores[k:] * scores[:-k] * near).sum(axis=0)
     added *= count / max(count - size, 1)
     variance = np.diag(covariance(sums, blocks, prior)) + np.maximum(added, 0.0)
-    few = student.ppf(0.975, max(count - 1, 1)) / student.ppf(0.975, np.inf)
+    few = stdtrit(max(count - 1, 1), 0.975) / stdtrit(np.inf, 0.975)
     return np.minimum(np.sqrt(variance) * few, prior)
 
 

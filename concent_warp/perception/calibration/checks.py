@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from concent_warp.perception.calibration.bundle import INTRINSICS, SIZE, BundleFit, Problem
 from concent_warp.perception.calibration.footage import Footage
@@ -27,7 +27,7 @@ UNKNOWN_FOCAL = 5.0
 
 def quantile(fit: BundleFit) -> float:
     """Return the factor from a standard deviation to half of a 95 % interval."""
-    return float(student.ppf(0.975, fit.degrees_of_freedom))
+    return float(stdtrit(fit.degrees_of_freedom, 0.975))
 
 
 def size_check(fit: BundleFit) -> Check:
@@ -84,7 +84,7 @@ def depth_check(fit: BundleFit, problem: Problem, footage: Footage) -> Check | N
     kept = np.abs(np.array(ratios) - 1 - value) < 5 * np.median(np.abs(np.array(ratios) - 1 - value)) + 1e-4
     value = float(np.mean(np.array(ratios)[kept])) - 1
     scatter = float(np.std(np.array(ratios)[kept], ddof=1)) / np.sqrt(kept.sum())
-    half = float(student.ppf(0.975, kept.sum() - 1)) * float(np.hypot(scatter, fit.std(SIZE)[0]))
+    half = float(stdtrit(kept.sum() - 1, 0.975)) * float(np.hypot(scatter, fit.std(SIZE)[0]))
     return Check("depth", 100 * value, 100 * (value - half), 100 * (value + half), "%", NOTEWORTHY_DEPTH)
 
 

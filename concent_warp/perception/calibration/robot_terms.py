@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from concent_warp.perception.calibration.robot_surface import Surface
 
@@ -185,4 +185,4 @@ def half_widths(
     count = len(equations)
     steps = np.array([solve(equations, free, state, known, without=k) for k in range(count)])
     variance = (count - 1) / count * ((steps - steps.mean(axis=0)) ** 2).sum(axis=0)
-    return float(student.ppf(0.975, count - 1)) * np.sqrt(variance)
+    return float(stdtrit(count - 1, 0.975)) * np.sqrt(variance)

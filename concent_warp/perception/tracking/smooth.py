@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from concent_warp.perception.tracking.cfg import SmoothCfg
 from concent_warp.perception.tracking.geometry.pose import moved, twist_between
@@ -70,7 +70,7 @@ def smooth(
     for _ in range(MAX_IMPACTS):
         surprise = np.where(acceleration < cfg.impact, run.surprise, 0.0)
         worst = int(surprise.argmax())
-        if surprise[worst] <= chi2.ppf(cfg.surprising, 6):
+        if surprise[worst] <= chdtri(6, 1 - cfg.surprising):
             break
         # Between two frames the impact may be near either; in a gap before this one, anywhere.
         first = worst
