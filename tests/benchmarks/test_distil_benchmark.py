@@ -31,8 +31,8 @@ def test_a_stopped_benchmark_goes_on_and_its_page_has_what_was_measured(tmp_path
         teachers=("shape_sorter",), controls=(), episodes=1, device="cpu", data=tmp_path / "rows.jsonl", distil=longer
     )
     with monkeypatch.context() as patch:
-        patch.setattr(dagger, "time", Clock())  # a second is the least time that is given
-        Benchmark(replace(args, seconds=0.5), tmp_path / "runs").run()
+        patch.setattr(dagger, "time", Clock())  # the training takes more looks than there are seconds
+        Benchmark(replace(args, seconds=6.0), tmp_path / "runs").run()
     assert "shape_sorter student 0 training" not in Measurements(args.data).rows
     begun = cw.load_student(tmp_path / "runs" / "shape_sorter_student_0").weights["iteration"]
     assert 0 < begun < 6

@@ -35,6 +35,7 @@ NEGATIVE = {
        for prefix in ("", "environment.observation.", "stress.", "evaluate.")
        for name in ("position", "orientation")},
     "--limits.workspace": COORDINATE,
+    "--environment.reset.before": "after the stage's start, not before it",
     "--reality.expert.grip-height": COORDINATE,
     "--reality.sensing.camera-position": COORDINATE,
     "--reality.sensing.camera-target": COORDINATE,

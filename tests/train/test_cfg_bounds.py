@@ -41,7 +41,7 @@ SHARES = (
 )  # fmt: skip
 """Settings from 0 to 1."""
 SIGNED = (
-    "environment.reward.engineered.hole", "environment.reward.engineered.seat",
+    "environment.reset.before", "environment.reward.engineered.hole", "environment.reward.engineered.seat",
     *(f"{of}.sensors.{what}_bias"
       for of in ("environment.observation", "stress") for what in ("position", "orientation")),
 )  # fmt: skip
