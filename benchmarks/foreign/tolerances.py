@@ -24,6 +24,7 @@ from benchmarks.foreign.cases import all_cases
 from benchmarks.foreign.log import Case
 from benchmarks.foreign.scoring import KINDS
 from benchmarks.foreign.study import described
+from benchmarks.independent.__main__ import revision
 from benchmarks.independent.study import path
 from benchmarks.pages import machine, machine_line, table, write_data, write_page
 from concent_warp.comparison.compare import compare
@@ -41,6 +42,8 @@ is not asked. Where nothing is hidden, masses, lengths and gains of these logs a
 damping by up to 4 %. No setting was chosen by looking at these logs. What a small effect leaves may be no more than
 tolerances do: `concent diagnose` fits nominal values, and finds some of these.
 """
+KEPT = ("name", "machine", "kind", "locked")
+"""What rows say of their logs."""
 HIDDEN = {
     "null": "nothing hidden",
     "single": "one effect",
@@ -64,8 +67,13 @@ class Args:
 
 def main(args: Args) -> None:
     """Compare what is not done yet, and write the page."""
-    args.out.mkdir(parents=True, exist_ok=True)
     cases = [case for case in all_cases() if not args.names or case.name in args.names]
+    if unknown := set(args.names) - {case.name for case in cases}:
+        raise SystemExit(
+            f"ordinary tolerances: no log is called {', '.join(sorted(unknown))}; "
+            "python -m benchmarks.foreign --list prints all"
+        )
+    args.out.mkdir(parents=True, exist_ok=True)
     todo = [case for case in cases if not path(args.out, case.name).is_file()]
     begun = time.monotonic()
     work = Parallel(args.jobs, return_as="generator_unordered")(delayed(keep)(args.out, case) for case in todo)
@@ -75,13 +83,13 @@ def main(args: Args) -> None:
     if args.names:
         return
     rows = [json.loads(path(args.out, case.name).read_text()) for case in cases]
-    write({"machine": machine(), "rows": rows})
+    write({"machine": machine(), "revision": revision(), "rows": rows})
 
 
 def write(data: dict[str, Any]) -> None:
     """Write the page and its data: the machine, and a row a log."""
     write_data(NAME, data)
-    write_page(NAME, page(data["rows"], machine_line(data["machine"])))
+    write_page(NAME, page(data["rows"], f"{machine_line(data['machine'])} Revision `{data['revision']}`."))
 
 
 def keep(out: Path, case: Case) -> str:
@@ -96,13 +104,14 @@ def studied(case: Case) -> dict[str, Any]:
         folder = Path(place) / case.name
         case.make().write(folder)
         recording = load_recording(folder)
-    result, begun = described(case), time.process_time()
+    result = {key: value for key, value in described(case).items() if key in KEPT}
+    begun = time.process_time()
     try:
         found = compare(Model.from_recording(recording), recording)
     except Exception:
         return result | {"error": traceback.format_exc()}
     ratios = {channel: found.summarise(found.after, channel).ratio for channel in found.channels}
-    known = {channel: ratio for channel, ratio in ratios.items() if ratio is not None}
+    known = {channel: ratio for channel, ratio in ratios.items() if ratio is not None and not np.isnan(ratio)}
     beyond = [c for c, of in found.tolerances.items() if known.get(c, 0.0) > of.high]
     return result | {
         "ratio": min(max(known.values(), default=0.0), 1e9),

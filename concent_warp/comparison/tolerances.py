@@ -36,7 +36,7 @@ class ToleranceCfg:
     draws: Annotated[int, Bounds(0, 1000)] = 8
     """Models whose nominal values are drawn from their tolerances [-]; 0 for none."""
     min_ratio: Factor = 1.5
-    """RMS error over the noise in a channel from which on this is asked [-]."""
+    """RMS error over the noise in a channel of a demonstration from which on this is asked [-]."""
     max_steps: Count = 1_000_000
     """Most simulation steps for all draws together; with more, there are fewer draws. Some seconds of computation."""
 
@@ -143,7 +143,7 @@ def _changes(
 ) -> dict[str, float]:
     """Return by how much another model's predictions differ from those of found residuals, RMS over the noise.
 
-    By channel with known noise; infinite where a replay diverges.
+    By channel with known noise; infinite where a replay diverges. Of tracked points it is how far their mean moves.
     """
     simulator, compiled = make_engine(engine, other), other.compile()
     changes: dict[str, list[np.ndarray]] = {}
@@ -154,6 +154,7 @@ def _changes(
             there = np.isfinite(before.error)
             if before.noise and there.any():
                 away = np.linalg.norm(np.nan_to_num(after.value - before.value), axis=1)
+                away *= 1.0 if before.weight is None else before.weight
                 away[np.isinf(after.error)] = np.inf
                 changes.setdefault(before.channel, []).append(away[there] / before.noise)
     return {channel: noise_ratio(np.concatenate(of)) for channel, of in changes.items()}

@@ -56,6 +56,14 @@ def test_a_log_is_compared_once_and_kept(tmp_path, monkeypatch, capsys):
     tolerances.main(tolerances.Args(out=tmp_path, names=("hoist-overload",)))
 
 
+def test_a_log_that_is_not_there_is_said_before_anything_is_written(tmp_path):
+    with pytest.raises(
+        SystemExit, match=r"no log is called hoist-nul; python -m benchmarks\.foreign --list prints all"
+    ):
+        tolerances.main(tolerances.Args(out=tmp_path / "out", names=("hoist-null", "hoist-nul")))
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_error_of_a_comparison_is_kept(monkeypatch):
     def broken(*_):
         raise RuntimeError("no such thing")
