@@ -84,6 +84,7 @@ _HOMES = {
     "report.report": ("write_report",),
     "report.tracking.cfg": ("LiveTrackCfg", "TrackReportCfg"),
     "report.tracking.report": ("write_track_report",),
+    "scene.payloads": ("Payload",),
     "scene.scene": ("Scene",),
     "scene.spheres.build": ("ContactGeometryCfg",),
     "scene.spheres.contact_geometry": ("ContactGeometry",),
@@ -195,6 +196,7 @@ if TYPE_CHECKING:
     from concent_warp.report.report import write_report
     from concent_warp.report.tracking.cfg import LiveTrackCfg, TrackReportCfg
     from concent_warp.report.tracking.report import write_track_report
+    from concent_warp.scene.payloads import Payload
     from concent_warp.scene.scene import Scene
     from concent_warp.scene.spheres.build import ContactGeometryCfg
     from concent_warp.scene.spheres.contact_geometry import ContactGeometry

@@ -18,6 +18,7 @@ from concent_warp.effects.table import checked_values, effects_table, posteriors
 from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none, write_text
 from concent_warp.recording.recording import Recording
+from concent_warp.scene.payloads import Payload, scene_with_payloads
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.objects import load_object
 from concent_warp.scene.spheres.build import ContactGeometryCfg
@@ -105,6 +106,10 @@ class Model:
     def with_geometry(self, geometry: ContactGeometry | None) -> Model:
         """Return a copy with another contact geometry."""
         return replace(self, geometry=geometry)
+
+    def with_payloads(self, payloads: Sequence[Payload]) -> Model:
+        """Return the model of a demonstration in which bodies carried payloads, the same one where there are none."""
+        return replace(self, scene=scene_with_payloads(self.scene, tuple(payloads))) if payloads else self
 
     def add(self, effect: Effect, values: Mapping[str, float] | Sequence[float] | None = None) -> Model:
         """Return a copy with one more effect.

@@ -82,6 +82,7 @@ class TrainingRun:
         """Return the inputs for one demonstration of a recording, the first by default; extract its events if None."""
         name = recording[0].name if demonstration is None else demonstration
         one = recording.only([name])
+        one.check_unloaded("a training")
         if events is None:
             events = extract(model, one[0], MujocoEngine(model, threads=1))
         return TrainingRun(model, one, events, cfg)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -73,7 +73,7 @@ def fit_geometry(
 
     Raises:
         ModelError: The scene has no objects to lay spheres on, or the checkpoint belongs to another fit.
-        RecordingError: The recording does not observe any movable object.
+        RecordingError: The recording does not observe any movable object, or a body carried a payload.
 
     Example:
         >>> import concent_warp as cw
@@ -98,6 +98,7 @@ def fit_geometry(
     if segments is None:
         names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
         chosen = [recording[name] for name in names]
+        replace(recording, demonstrations=tuple(chosen)).check_unloaded("a fit of contact geometry")
         shown = chosen if cfg.window is None else []
         segments = cut_segments(model, chosen, cfg)
     search = Search(model, list(segments), cfg, engine)

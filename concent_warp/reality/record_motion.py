@@ -17,6 +17,7 @@ from concent_warp.reality.rigs.rig import Rig, RigTrial, recorded_trial
 from concent_warp.reality.run import simulate, simulate_to_rest
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.scene.payloads import fasten
 from concent_warp.scene.scene import Scene
 
 SETTLING_TIME = 0.3
@@ -43,8 +44,9 @@ def record_rig_motion(rig: Rig, motion: Recording, effects: Sequence[HiddenEffec
     if rig.recorder is not None:
         raise ConcentError(f"the rig {rig.name} performs the motions of its scripted expert only", fix="take --task")
     _check_scene(motion, rig.scene)
-    model, taken = rig.world(effects).compile(), []
+    taken = []
     for k, d in enumerate(motion.demonstrations):
+        model = _loaded(rig.world(effects), d).compile()
         trial = RigTrial(
             d.duration,
             {name: (c.time, np.asarray(c.value, dtype=float).ravel()) for name, c in d.action.items()},
@@ -53,7 +55,7 @@ def record_rig_motion(rig: Rig, motion: Recording, effects: Sequence[HiddenEffec
             settling_time=SETTLING_TIME if d.action and _is_carried(rig.scene.model, d) else 0.0,
         )
         rng = np.random.default_rng([seed, STREAM, k])
-        taken.append(recorded_trial(rig, model, trial, effects, rng, f"demo_{k}"))
+        taken.append(replace(recorded_trial(rig, model, trial, effects, rng, f"demo_{k}"), payloads=d.payloads))
     return Recording(rig.scene.xml, tuple(taken), source=f"reality rig {rig.name}")
 
 
@@ -84,8 +86,10 @@ def record_motion(
     scene = (task or cfg.task).build()
     _check_scene(motion, scene)
     world = cfg.world.build(scene, effects)
-    model, taken, count = world.compile(), [], len(motion.demonstrations)
+    taken, count = [], len(motion.demonstrations)
     for k, d in enumerate(motion.demonstrations):
+        loaded = _loaded(world, d)
+        model = loaded.compile()
         rng, data = np.random.default_rng([seed, STREAM, k]), mujoco.MjData(model)
         nominal = scene.model
         for joint, value in _by_joint(nominal, d.qpos, velocity=False).items():
@@ -102,10 +106,20 @@ def record_motion(
             cfg.sensing, scene, model, data, time, action, effects, rng,
             None if progress is None else lambda share, k=k: progress((k + share) / count),
         )  # fmt: skip
-        sensed = sensed_motion(cfg, scene, world, model, log, effects, rng)
+        sensed = sensed_motion(cfg, scene, loaded, model, log, effects, rng)
         actions = {model.actuator(i).name: Channel(time, action[:, i]) for i in range(model.nu)}
-        taken.append(Demonstration(f"demo_{k}", d.task, None, qpos, qvel, actions, *sensed))
+        made = Demonstration(f"demo_{k}", d.task, None, qpos, qvel, actions, *sensed)
+        taken.append(replace(made, payloads=d.payloads))
     return Recording(scene.xml, tuple(taken), source="reality")
+
+
+def _loaded(world: mujoco.MjSpec, d: Demonstration) -> mujoco.MjSpec:
+    """Return Reality in which bodies carry the payloads of a motion."""
+    if not d.payloads:
+        return world
+    loaded = world.copy()
+    fasten(loaded, d.payloads)
+    return loaded
 
 
 def renumbered(recordings: Sequence[Recording]) -> Recording:

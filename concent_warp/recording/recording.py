@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.scene.payloads import Payload
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ class Demonstration:
     """RGB-D streams, by camera name."""
     policy: PolicyLog | None = None
     """What the policy observed and did, in a trial of one."""
+    payloads: tuple[Payload, ...] = ()
+    """Known weights that bodies carried, which the scene does not have."""
 
     @property
     def duration(self) -> float:
@@ -204,3 +207,21 @@ class Recording:
         if unknown := sorted(set(names) - set(known)):
             raise RecordingError("no such demonstration", where=self.source, expected=f"some of {known}", found=unknown)
         return replace(self, demonstrations=tuple(d for d in self.demonstrations if not names or d.name in names))
+
+    def check_unloaded(self, purpose: str) -> None:
+        """Check that no body carried a payload.
+
+        Args:
+            purpose: What the demonstrations are wanted for, such as "a fit of contact geometry".
+
+        Raises:
+            RecordingError: One did.
+        """
+        if loaded := [d.name for d in self.demonstrations if d.payloads]:
+            raise RecordingError(
+                f"a body carried a payload, which {purpose} does not take into account",
+                where=self.source,
+                expected="demonstrations in the scene as it is",
+                found=loaded,
+                fix="leave these demonstrations out",
+            )

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from concent_warp.effects.force_model import ForceModel
     from concent_warp.model import Model
+    from concent_warp.scene.payloads import Payload
 
 Contacts = Literal["none", "touched", "all"]
 """What a rollout keeps of the contacts: nothing, which geoms ever touched which bodies, or all of every step."""
@@ -129,6 +130,13 @@ class Engine(Protocol):
     @property
     def compiled(self) -> mujoco.MjModel:
         """The compiled model that geom ids refer to. Not to be edited."""
+        ...
+
+    def carrying(self, payloads: tuple[Payload, ...]) -> Engine:
+        """Return the engine for demonstrations in which bodies carried payloads; this one where there are none.
+
+        Geoms, joints, actuators and sensors are the same; bodies are counted otherwise.
+        """
         ...
 
     def run(

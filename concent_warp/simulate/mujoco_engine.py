@@ -44,6 +44,7 @@ from concent_warp.simulate.time_limit import time_check
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
     from concent_warp.model import Model
+    from concent_warp.scene.payloads import Payload
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -91,6 +92,7 @@ class MujocoEngine:
         self._compilers: queue.SimpleQueue[VariantCompiler] = queue.SimpleQueue()
         self._data: queue.SimpleQueue[mujoco.MjData] = queue.SimpleQueue()
         self._roomy: bool | None = None
+        self._carrying: dict[tuple[Payload, ...], MujocoEngine] = {}
         if memory is not None:
             self._resize(memory)
         self.repeats = 0
@@ -115,6 +117,22 @@ class MujocoEngine:
     def memory(self) -> int:
         """Arena of one simulation [bytes], as it has grown so far."""
         return int(self._compiled.narena)
+
+    def carrying(self, payloads: tuple[Payload, ...]) -> MujocoEngine:
+        """Return the engine for demonstrations in which bodies carried payloads, see `Engine.carrying`."""
+        if not payloads:
+            return self
+        if payloads not in self._carrying:
+            self._carrying[payloads] = MujocoEngine(
+                self.model.with_payloads(payloads),
+                collidable=self._collidable,
+                threads=self.threads,
+                memory=self._memory,
+                max_memory=self.max_memory,
+                processes=self._processes,
+                batches=self._batches,
+            )
+        return self._carrying[payloads]
 
     def run(
         self,

@@ -226,9 +226,12 @@ def replay(
 ) -> Rollout:
     """Run the recorded commands, as the model's effects change them, from the recorded initial state.
 
-    One variant, see `Engine.run`.
+    One variant, see `Engine.run`, with the payloads of the demonstration; bodies are those of the model without.
     """
     compiled = model.scene.model
+    if demonstration.payloads and bodies is None:
+        bodies = [engine.compiled.body(b).name for b in range(engine.compiled.nbody)]
+    engine = engine.carrying(demonstration.payloads) if demonstration.payloads else engine
     steps = step_count(demonstration, engine.timestep)
     qpos, qvel = initial_state(compiled, demonstration)
     ctrl = acting_commands(model, compiled, demonstration, steps)

@@ -25,6 +25,7 @@ from concent_warp.simulate.warp_program import Buffers, Demand, Plan, Program, w
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
+    from concent_warp.scene.payloads import Payload
 
 BITS = mjw.OverflowType
 GROWING = BITS.NEFC | BITS.NJMAX_NNZ | BITS.BROADPHASE | BITS.NARROWPHASE | BITS.CCD | BITS.CONTACT_MATCH
@@ -90,13 +91,15 @@ class WarpEngine:
             raise EngineError(f"{', '.join(foreign)} cannot run on MuJoCo-Warp", fix="use MujocoEngine")
         self.model = model
         self.device = str(wp.get_device(device if device is not None else preferred_device()))
-        self._compiled, self._sphere_geom = compile_model(model, collidable)
+        self._collidable = None if collidable is None else np.array(collidable)
+        self._compiled, self._sphere_geom = compile_model(model, self._collidable)
         self._max_memory = _free_memory(self.device) if max_memory is None else int(max_memory)
         self._max_worlds = max_worlds
         self._nconmax, self._njmax = nconmax, njmax
         self._buffers: Buffers | None = None
         self._world_bytes: dict[Buffers, int] = {}
         self._programs: OrderedDict[Plan, Program] = OrderedDict()
+        self._carrying: dict[tuple[Payload, ...], WarpEngine] = {}
         self.repeats = 0
         """How often the last run was repeated with larger buffers."""
         self.limited = 0
@@ -116,6 +119,22 @@ class WarpEngine:
     def sphere_geom(self) -> np.ndarray:
         """Geom id of each sphere of the model's geometry, shape (S,) int; -1 for those that are not collidable."""
         return self._sphere_geom
+
+    def carrying(self, payloads: tuple[Payload, ...]) -> WarpEngine:
+        """Return the engine for demonstrations in which bodies carried payloads, see `Engine.carrying`."""
+        if not payloads:
+            return self
+        if payloads not in self._carrying:
+            self._carrying[payloads] = WarpEngine(
+                self.model.with_payloads(payloads),
+                collidable=self._collidable,
+                device=self.device,
+                nconmax=self._nconmax,
+                njmax=self._njmax,
+                max_memory=self._max_memory,
+                max_worlds=self._max_worlds,
+            )
+        return self._carrying[payloads]
 
     @property
     def buffers(self) -> Buffers | None:

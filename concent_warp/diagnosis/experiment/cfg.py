@@ -23,10 +23,8 @@ class MotionMenuCfg:
     """Longest motion [s]. Empirical."""
     instants: Count = 40
     """Instants within a demonstration at which speeds are read."""
-    extra_mass: float = 0.5
+    extra_mass: Positive = 1.0
     """Mass of a payload over the mass of the body that carries it [-]. Empirical."""
-    payload_radius: Positive = 0.01
-    """Radius of a payload, which is a sphere without contact [m]."""
     sweep_speeds: tuple[Positive, ...] = (0.1, 0.4, 1.0)
     """Speeds of the sweeps over the highest recorded speed [-]: viscous and Coulomb friction differ between speeds."""
     time_scales: tuple[Positive, Positive] = (1.5, 0.5)

@@ -32,7 +32,14 @@ def future_window(recorded: RecordedRange, motion: ProposedMotion, duration: flo
     if not count:
         return None
     measured = {r.channel: Channel(r.time, r.value, noise_std=r.std) for r in readings}
-    d = Demonstration(motion.name, qpos=motion.qpos, qvel=motion.qvel, action=motion.action, measured=measured)
+    d = Demonstration(
+        motion.name,
+        qpos=motion.qpos,
+        qvel=motion.qvel,
+        action=motion.action,
+        measured=measured,
+        payloads=motion.payloads,
+    )
     spread = start_spread(m, {c: recorded.noise[c] for c in channels}, recorded.observation)
     clocks = np.concatenate(clock)
     return Window(

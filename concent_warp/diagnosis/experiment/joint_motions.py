@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 
 from concent_warp.comparison.units import channel_text
-from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, heavier, slope_turned
-from concent_warp.effects.select import driven_joints, gripper_actuators, outermost_links, servo_gain
+from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, slope_turned
+from concent_warp.diagnosis.experiment.payloads import loaded, on_link, payload_links
+from concent_warp.effects.select import driven_joints, gripper_actuators, servo_gain
 from concent_warp.recording.recording import Channel
 
 
@@ -84,30 +85,8 @@ def drive_motions(recorded: RecordedRange, tilted: bool) -> Iterator[ProposedMot
         return
     made = list(_trajectories(recorded, drives))
     yield from made
-    for link in _payload_links(recorded, drives):
-        for motion in made:
-            if motion.name != "steps":
-                text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {channel_text(link)}, {motion.text}"
-                change = heavier(link, recorded.cfg)
-                yield replace(motion, name=f"{motion.name} with payload", text=text, change=change)
-
-
-def _payload_links(recorded: RecordedRange, drives: Drives) -> list[str]:
-    """Return the names of the last links that the drives carry and that can carry a payload."""
-    m = recorded.m
-    moved = {int(m.jnt_bodyid[j]) for a in drives.ids for j in driven_joints(m, a)}
-    return [
-        m.body(b).name for b in outermost_links(m) if m.body(b).name and m.body_mass[b] > 0 and _above(m, b) & moved
-    ]
-
-
-def _above(m: mujoco.MjModel, body: int) -> set[int]:
-    """Return the ids of a body and of those that carry it."""
-    found = {0}
-    while body:
-        found.add(body)
-        body = int(m.body_parentid[body])
-    return found
+    for link in payload_links(recorded, drives.ids):
+        yield from (loaded(motion, on_link(recorded, link)) for motion in made if motion.name != "steps")
 
 
 def _trajectories(recorded: RecordedRange, drives: Drives) -> Iterator[ProposedMotion]:

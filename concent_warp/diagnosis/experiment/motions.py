@@ -1,4 +1,4 @@
-"""Motions that could be recorded next: initial state, commands, and changes of the set-up.
+"""Motions that could be recorded next: initial state, commands, payloads, and changes of the surroundings.
 
 Speeds, commands and positions stay within the range of the present recording. Motions of drives are in `joint_motions`,
 those of objects in `object_motions`.
@@ -19,13 +19,14 @@ from concent_warp.effects.select import POSES, free_bodies
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording
 from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.scene.payloads import Payload
 from concent_warp.simulate.replay import commands, initial_state
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
 
 Change = Callable[["Model"], "Model"]
-"""A change of the set-up: takes the model of the present one, returns that of the changed one."""
+"""A change of the surroundings: takes the model of the present one, returns that of the changed one."""
 
 
 def _unchanged(model: Model) -> Model:
@@ -52,11 +53,13 @@ class ProposedMotion:
     away: tuple[str, ...] = ()
     """Bodies that are moved out of the way and not measured."""
     change: Change = _unchanged
-    """Change of the set-up."""
+    """Change of the surroundings."""
+    payloads: tuple[Payload, ...] = ()
+    """Known weights that bodies carry."""
 
 
 def changes_set_up(motion: ProposedMotion) -> bool:
-    """Return whether the set-up has to be changed for a motion: a payload added, the table turned."""
+    """Return whether the surroundings have to be changed for a motion: the table turned."""
     return motion.change is not _unchanged
 
 
@@ -150,26 +153,6 @@ class RecordedRange:
 def _channel(d: Demonstration, channel: str) -> Channel:
     """Return a channel of a demonstration, empty where it has none."""
     return d.measured.get(channel, Channel(np.zeros(0), np.zeros((0, 1))))
-
-
-def heavier(body: str, cfg: MotionMenuCfg) -> Change:
-    """Return the change that fastens a payload to a body, at its centre of mass."""
-
-    def change(model: Model) -> Model:
-        from concent_warp.scene.scene import Scene
-
-        m, spec = model.scene.model, model.scene.spec()
-        row = m.body(body).id
-        spec.body(body).add_body(name=f"{body}_payload", pos=m.body_ipos[row]).add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[cfg.payload_radius, 0, 0],
-            mass=cfg.extra_mass * float(m.body_mass[row]),
-            contype=0,
-            conaffinity=0,
-        )
-        return replace(model, scene=Scene.from_spec(spec, model.scene.source))
-
-    return change
 
 
 def slope_turned(model: Model) -> Model:

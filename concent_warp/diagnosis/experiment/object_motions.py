@@ -11,12 +11,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.comparison.units import channel_text
-from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, heavier, slope_turned
+from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, slope_turned
+from concent_warp.diagnosis.experiment.payloads import loaded, on_object
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
 
 UP = np.array([0.0, 0.0, 1.0])
+LOADED = ("slide", "spin in place", "roll", "throw")
+"""Kinds of motions by hand of which the fastest is also made with weights on the object."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +102,11 @@ def body_motions(recorded: RecordedRange, engine: EngineName, tilted: bool) -> I
         moves = [*_surface_motions(obj), *_flights(obj)]
         yield from moves
         yield from _turned_starts(obj)
-        first = moves[:1]
-        for motion in first:
-            text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {channel_text(obj.name)}, {motion.text}"
-            yield replace(motion, name=f"{motion.name}, heavier", text=text, change=heavier(obj.name, recorded.cfg))
+        speeds = [round(float(np.linalg.norm(motion.qvel)), 9) for motion in moves]
+        slowest_first = sorted(range(len(moves)), key=lambda k: (speeds[k], -k))
+        kinds = {moves[k].name: moves[k] for k in slowest_first}
+        yield from (loaded(kinds[name], on_object(recorded, body)) for name in LOADED if name in kinds)
+        for motion in moves[:1]:
             if tilted:
                 text = f"turn the table by 180 deg, so that its slope runs the other way, and {motion.text}"
                 yield replace(motion, name=f"{motion.name}, turned table", text=text, change=slope_turned)
@@ -177,7 +181,7 @@ def _flights(obj: ThrowableBody) -> Iterator[ProposedMotion]:
 
 
 def _turned_starts(obj: ThrowableBody) -> Iterator[ProposedMotion]:
-    """Yield repetitions of a robot's commands, with the object turned about the vertical or heavier."""
+    """Yield repetitions of a robot's commands, with the object turned about the vertical or loaded."""
     d, recorded = obj.recorded.longest, obj.recorded
     if not d.action:
         return
@@ -186,10 +190,8 @@ def _turned_starts(obj: ThrowableBody) -> Iterator[ProposedMotion]:
         turned = obj.pose(qpos, np.zeros(3), np.radians(degrees) * UP)
         text = f"turn {channel_text(obj.name)} by {degrees} deg and repeat the same commands"
         yield ProposedMotion("repeat with the turned object", text, d.duration, turned, qvel, d.action)
-    text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {channel_text(obj.name)}, repeat the same commands"
-    yield ProposedMotion(
-        "repeat, heavier", text, d.duration, qpos, qvel, d.action, change=heavier(obj.name, recorded.cfg)
-    )
+    again = ProposedMotion("repeat", "repeat the same commands", d.duration, qpos, qvel, d.action)
+    yield loaded(again, on_object(recorded, obj.body))
 
 
 def _roll(obj: ThrowableBody, rest: np.ndarray) -> tuple[np.ndarray, float] | None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+
+from concent_warp.scene.payloads import Payload
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class SuggestedMotion:
     """Motions of free bodies by name, without those in `away`."""
     away: tuple[str, ...] = ()
     """Objects that are moved out of the way before."""
+    payloads: tuple[Payload, ...] = ()
+    """Known weights that bodies carry."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the motion in plain types."""
@@ -70,7 +74,8 @@ class SuggestedMotion:
             key: {name: item.to_json() for name, item in getattr(self, key).items()}
             for key in ("commands", "joints", "objects")
         }
-        return {"duration": self.duration, "away": list(self.away), **series}
+        carried = [asdict(payload) for payload in self.payloads]
+        return {"duration": self.duration, "away": list(self.away), "payloads": carried, **series}
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ def motion_trajectory(model: Model, motion: ProposedMotion, engine: EngineName, 
     """Return a motion as a model predicts it.
 
     Args:
-        model: The model of the present set-up; the motion's change of the set-up is applied to it.
+        model: The model of the present set-up; the motion's changes of it are applied.
         motion: The motion.
         engine: Which engine simulates.
         rate: Sampling rate of joints and objects [Hz].
     """
-    model = motion.change(model)
+    model = motion.change(model).with_payloads(motion.payloads)
     simulator = make_engine(engine, model)
     m, dt = simulator.compiled, simulator.timestep
     steps = max(round(motion.duration / dt), 1)
@@ -48,7 +48,7 @@ def motion_trajectory(model: Model, motion: ProposedMotion, engine: EngineName, 
         if m.body(b).name not in motion.away
     }
     sent = {name: TimeSeries(c.time, c.value.ravel(), command_unit(m, name)) for name, c in motion.action.items()}
-    return SuggestedMotion(motion.duration, sent, joints, objects, motion.away)
+    return SuggestedMotion(motion.duration, sent, joints, objects, motion.away, motion.payloads)
 
 
 def _object_motion(m: mujoco.MjModel, body: int, time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> ObjectMotion:

@@ -70,7 +70,7 @@ def locate_forces(
         cfg = replace(cfg, length=max(map(window_length, motions)))
     windows = []
     for k, (d, motion) in enumerate(zip(chosen, motions, strict=True)):
-        windows.append(window_forces(d.name, simulator, motion, cfg))
+        windows.append(window_forces(d.name, simulator.carrying(d.payloads), motion, cfg))
         report(0.1 + 0.6 * (k + 1) / len(chosen))
     features = [joint_features(w, m, cfg.features) for w, m in zip(windows, motions, strict=True)]
     unknown = _driven_with_a_state(motions[0].compiled)

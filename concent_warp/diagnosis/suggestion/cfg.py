@@ -99,6 +99,9 @@ class SuggestCfg:
     """Batches without a better trajectory after which a search ends."""
     min_gain: Positive = 0.01
     """What counts as better, in the logarithm that the search maximises [-]: odds that are lower by 1 %."""
+    payloads: bool = True
+    """Whether a known weight may be fastened to a link or an object (`MotionMenuCfg.extra_mass`), where no motion
+    without one decides everything."""
     max_hypotheses: Annotated[int, Bounds(2, 64)] = 6
     """Most hypotheses that are compared, the likeliest first; the cost grows with their number."""
     max_interval: Positive = 0.25
@@ -107,6 +110,9 @@ class SuggestCfg:
     decisive: Positive = 0.05
     """Squared error by which a refitted hypothesis must exceed the true one, over that of all data, old and new, to be
     excluded [-]: 2.5 times what a diagnosis counts as equal (`SearchCfg.near_equal`)."""
+    clear_separation: Positive = 3.0
+    """RMS difference of predictions over the noise, the second hypothesis refitted, from which on evidence counts in
+    full [-]: below, errors of the formulas may be as large. Empirical."""
     max_nominal_values: int = 8
     """Most nominal values (masses, lengths, gains, latencies within their tolerance, `NominalCfg`) that a refit may
     shift in the search [-]; where there are more, they are open for the best motions only, as simulations grow with

@@ -65,14 +65,23 @@ class Forecast:
         evidence, separation, channels, count = plain
         return Forecast(np.array(evidence), np.array(separation), tuple(map(tuple, channels)), int(count))
 
-    def score(self, needed: float) -> float:
+    def score(self, needed: float, clear: float) -> float:
         """Return what a search maximises: minus the log of the mean odds that hypotheses stay confused.
+
+        Evidence of many readings by a small difference counts less: formulas are not exact, and their errors are as
+        large as what they leave, however many readings there are.
 
         Args:
             needed: Evidence from which a hypothesis counts as excluded [nat].
+            clear: Separation from which on evidence counts in full [-].
         """
-        ratio = self.evidence / max(needed, 1e-9)
+        ratio = self.evidence / max(needed, 1e-9) * np.minimum(self.separation / clear, 1.0) ** 2
         return float(-np.log(np.mean(1 / (1 + ratio[~np.eye(len(ratio), dtype=bool)]))))
+
+    def decides(self, needed: float, clear: float) -> bool:
+        """Return whether all hypotheses are expected to be distinguished, by more than `clear`; see `score`."""
+        between = ~np.eye(len(self.evidence), dtype=bool)
+        return bool(((self.evidence >= needed) & (self.separation >= clear))[between].all())
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,11 @@ class MotionLimits:
         for d, (qpos, qvel) in zip(self.recorded.recording.demonstrations, self.recorded.starts, strict=True):
             steps = max(int(np.ceil(d.duration / simulator.timestep - 1e-9)), 1)
             ctrl = commands(simulator.compiled, d, steps)
-            rollout = simulator.run(Variants(1, qpos=qpos[None], qvel=qvel[None]), ctrl, bodies=[]).numpy()
+            rollout = (
+                simulator.carrying(d.payloads)
+                .run(Variants(1, qpos=qpos[None], qvel=qvel[None]), ctrl, bodies=[])
+                .numpy()
+            )
             found.append(self._extremes(rollout.qpos[0], rollout.qvel[0], ctrl))
         return _Extremes.joined(found)
 

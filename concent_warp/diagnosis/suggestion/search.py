@@ -19,7 +19,7 @@ from concent_warp.diagnosis.suggestion.evolution import DiagonalEvolution
 from concent_warp.diagnosis.suggestion.forecast import Course, Forecast, courses, forecasts
 from concent_warp.diagnosis.suggestion.hypotheses import Hypothesis
 from concent_warp.diagnosis.suggestion.limits import MotionLimits
-from concent_warp.diagnosis.suggestion.trajectories import Family, families
+from concent_warp.diagnosis.suggestion.trajectories import Family, families, loaded_families
 from concent_warp.simulate.select import EngineName
 
 OUT_OF_LIMITS = 10.0
@@ -92,6 +92,13 @@ class Search:
             searched = self.optimised()
             best = self._compared(searched, best)
             rated += searched
+        if method != "random" and self.cfg.payloads and not (best and self.decides(best[1])):
+            heavy = self.menu(loaded=True) if method != "optimised" else []
+            best = self._compared(heavy, best)
+            if method != "menu" and (best is None or self.score(best[1]) < self.enough):
+                heavy += self.optimised(loaded=True)
+                best = self._compared(heavy, best)
+            rated += heavy
         return Found(best, min(rated, key=lambda r: r.excess).words if rated else ())
 
     def _compared(
@@ -130,12 +137,18 @@ class Search:
 
     def score(self, found: Forecast) -> float:
         """Return the score of a forecast."""
-        return found.score(self.needed(found))
+        return found.score(self.needed(found), self.cfg.clear_separation)
 
-    def menu(self) -> list[Rated]:
-        """Return the motions of the menu that leave the set-up as it is; several of an object together."""
+    def decides(self, found: Forecast) -> bool:
+        """Return whether a motion with some forecast is expected to leave nothing open."""
+        return found.decides(self.needed(found), self.cfg.clear_separation)
+
+    def menu(self, *, loaded: bool = False) -> list[Rated]:
+        """Return the motions of the menu in the surroundings as they are, `loaded` or not; several of an object
+        together.
+        """
         recorded, found = self.recorded, list[Rated]()
-        singles = [m for m in self._menu_motions() if not changes_set_up(m)]
+        singles = [m for m in self._menu_motions() if not changes_set_up(m) and bool(m.payloads) == loaded]
         for k, batch in enumerate(_batches(singles, self.cfg.population)):
             candidates = [Candidate(m.name, m.text, (self._cut(m),), "menu") for m in batch]
             found += self.rate(candidates, [("menu", m.name, m.text) for m in batch], starts=True)
@@ -167,9 +180,11 @@ class Search:
         """Return a motion no longer than is allowed."""
         return replace(motion, duration=min(motion.duration, self.cfg.duration))
 
-    def optimised(self) -> list[Rated]:
-        """Return the best trajectory of each kind."""
-        kinds, found = families(self.recorded, self.cfg, self.engine), []
+    def optimised(self, *, loaded: bool = False) -> list[Rated]:
+        """Return the best trajectory of each kind, `loaded` or not."""
+        kinds, found = list[Family](families(self.recorded, self.cfg, self.engine)), []
+        if loaded:
+            kinds = [heavy for family in kinds for heavy in loaded_families(family)]
         for k, family in enumerate(kinds):
             begin, span = 0.3 + 0.6 * k / len(kinds), 0.6 / len(kinds)
             found += self._evolved(

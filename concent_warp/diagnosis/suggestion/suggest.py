@@ -141,6 +141,7 @@ def _arrays(recording: Recording) -> list[np.ndarray]:
     found = []
     for d in recording.demonstrations:
         found += [a for a in (d.qpos, d.qvel) if a is not None]
+        found += [np.array(payload.numbers) for payload in d.payloads]
         for channels in (d.action, d.measured):
             found += [array for c in channels.values() for array in (c.time, c.value)]
     return [np.ascontiguousarray(a) for a in found]
@@ -353,6 +354,7 @@ def motion_recording(recorded: RecordedRange, candidate: Candidate, model: Model
                 qvel=motion.qvel,
                 action=action,
                 measured=measured,
+                payloads=motion.payloads,
             )
         )
     return Recording(recorded.recording.scene, tuple(demonstrations), source="suggested motion")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from concent_warp.files import all_or_none, write_text
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
+from concent_warp.scene.payloads import PAYLOAD_HEADER
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,7 @@ class Suggestion:
             "source": self.source,
             "duration": self.duration,
             "motions": list(self.texts),
+            "payloads": [[asdict(p) for p in motion.payloads] for motion in self.motions],
             "hypotheses": list(self.models),
             "needed": self.needed,
             "pairs": [pair.to_json() for pair in self.pairs],
@@ -114,7 +116,8 @@ class Suggestion:
         Args:
             path: The motion file (``.h5``), which `load_recording`, ``concent replay`` and ``concent record --motion``
                 read. Beside it ``STEM.csv`` has the commands over time, a column an actuator, and ``STEM.objects.csv``,
-                where objects move, their poses; of several motions each has files of its own, ``STEM.2.csv``.
+                where objects move, their poses, and ``STEM.payloads.csv``, where bodies carry weights, these; of
+                several motions each has files of its own, ``STEM.2.csv``.
 
         Raises:
             ConcentError: Nothing is suggested, or a file cannot be written.
@@ -128,7 +131,11 @@ class Suggestion:
         with all_or_none():
             for k, motion in enumerate(self.motions):
                 stem = path.stem if k == 0 else f"{path.stem}.{k + 1}"
-                tables = {f"{stem}.csv": command_table(motion), f"{stem}.objects.csv": object_table(motion)}
+                tables = {
+                    f"{stem}.csv": command_table(motion),
+                    f"{stem}.objects.csv": object_table(motion),
+                    f"{stem}.payloads.csv": payload_table(motion),
+                }
                 for name, table in tables.items():
                     if table:
                         write_text(path.with_name(name), table)
@@ -140,7 +147,10 @@ class Suggestion:
 def motion_files(path: Path, count: int) -> list[Path]:
     """Return all files that `Suggestion.save` may write for some number of motions."""
     stems = [path.stem if k == 0 else f"{path.stem}.{k + 1}" for k in range(count)]
-    return [path, *(path.with_name(f"{stem}{end}") for stem in stems for end in (".csv", ".objects.csv"))]
+    return [
+        path,
+        *(path.with_name(f"{stem}{end}") for stem in stems for end in (".csv", ".objects.csv", ".payloads.csv")),
+    ]
 
 
 def command_table(motion: SuggestedMotion) -> str:
@@ -171,6 +181,14 @@ def object_table(motion: SuggestedMotion) -> str:
         columns += [*moved.position.T, *moved.orientation.T, *moved.velocity.T, *moved.angular_velocity.T]
     time = next(iter(motion.objects.values())).time
     return _table(names, [time, *columns])
+
+
+def payload_table(motion: SuggestedMotion) -> str:
+    """Return the weights that bodies carry as CSV, as a recording's ``payloads.csv``; empty where there is none."""
+    if not motion.payloads:
+        return ""
+    rows = [f"{p.body},{','.join(f'{n:.9g}' for n in p.numbers)}" for p in motion.payloads]
+    return "\n".join([",".join(PAYLOAD_HEADER), *rows, ""])
 
 
 def _table(names: Sequence[str], columns: Sequence[np.ndarray]) -> str:

@@ -5,7 +5,7 @@ position and speed by construction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -14,10 +14,12 @@ from concent_warp.comparison.units import channel_text
 from concent_warp.diagnosis.experiment.joint_motions import Drives, commanded_motion
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.object_motions import UP, ThrowableBody
+from concent_warp.diagnosis.experiment.payloads import loaded, on_link, on_object, payload_links, payload_text
 from concent_warp.diagnosis.suggestion.candidate import Candidate
 from concent_warp.diagnosis.suggestion.cfg import SuggestCfg
 from concent_warp.effects.select import gripper_actuators
 from concent_warp.recording.recording import Channel
+from concent_warp.scene.payloads import Payload
 from concent_warp.simulate.select import EngineName
 
 Source = Literal["optimised", "random"]
@@ -41,6 +43,11 @@ class Family(Protocol):
         """Whether initial states have to be estimated in the search already: bodies move, or are met, unobserved."""
         ...
 
+    @property
+    def carriers(self) -> tuple[tuple[Payload, ...], ...]:
+        """What may be fastened to a link or an object, each set of weights for itself."""
+        ...
+
     def candidate(self, parameters: np.ndarray, source: Source) -> Candidate:
         """Return the motion of parameters, shape (size,), which are about 1 in size."""
         ...
@@ -60,6 +67,47 @@ def families(recorded: RecordedRange, cfg: SuggestCfg, engine: EngineName) -> li
             for body in recorded.bodies[: recorded.cfg.max_bodies]
         ]
     return found
+
+
+@dataclass(frozen=True)
+class LoadedFamily:
+    """Motions of another kind with weights on a body."""
+
+    family: Family
+    payloads: tuple[Payload, ...]
+    carriers: tuple[tuple[Payload, ...], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the kind of motion."""
+        return f"{self.family.name} with {payload_text(self.payloads)}"
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.family.size
+
+    @property
+    def starts(self) -> bool:
+        """See `Family.starts`."""
+        return self.family.starts
+
+    def candidate(self, parameters: np.ndarray, source: Source) -> Candidate:
+        """Return the motion of parameters."""
+        plain = self.family.candidate(parameters, source)
+        motions = tuple(loaded(motion, self.payloads) for motion in plain.motions)
+        text = f"with {payload_text(self.payloads)}, {plain.text}"
+        return replace(plain, name=f"{plain.name} with payload", text=text, motions=motions)
+
+
+def loaded_families(family: Family) -> list[LoadedFamily]:
+    """Return a kind of motion with each of the weights that its bodies may carry."""
+    return [LoadedFamily(family, payloads) for payloads in family.carriers]
+
+
+def _on_links(recorded: RecordedRange, drives: Drives) -> tuple[tuple[Payload, ...], ...]:
+    """Return weights on each last link that drives move."""
+    return tuple(on_link(recorded, link) for link in payload_links(recorded, drives.ids))
 
 
 def _squashed(value: float | np.ndarray) -> np.ndarray:
@@ -107,6 +155,11 @@ class FourierFamily:
         """Number of parameters: frequency, and of each drive height, middle and coefficients."""
         return 1 + len(self.drives.ids) * (2 + 2 * self.cfg.trajectory.harmonics)
 
+    @property
+    def carriers(self) -> tuple[tuple[Payload, ...], ...]:
+        """See `Family.carriers`."""
+        return _on_links(self.recorded, self.drives)
+
     def candidate(self, parameters: np.ndarray, source: Source) -> Candidate:
         """Return the motion of parameters."""
         recorded, drives, shape = self.recorded, self.drives, self.cfg.trajectory
@@ -143,6 +196,12 @@ class RepeatFamily:
     def size(self) -> int:
         """Number of parameters: speed, frequency, grip, and of each drive height and coefficients."""
         return 3 + len(self.drives.ids) * (1 + 2 * self.cfg.trajectory.harmonics)
+
+    @property
+    def carriers(self) -> tuple[tuple[Payload, ...], ...]:
+        """See `Family.carriers`."""
+        objects = self.recorded.bodies[: self.recorded.cfg.max_bodies]
+        return (*_on_links(self.recorded, self.drives), *(on_object(self.recorded, b) for b in objects))
 
     def candidate(self, parameters: np.ndarray, source: Source) -> Candidate:
         """Return the motion of parameters."""
@@ -191,6 +250,11 @@ class ThrowFamily:
     def size(self) -> int:
         """Number of parameters: of each throw speed, heading (2), rise, height, tilt (2) and spin."""
         return self.each * self.cfg.trajectory.throws
+
+    @property
+    def carriers(self) -> tuple[tuple[Payload, ...], ...]:
+        """See `Family.carriers`."""
+        return (on_object(self.thrown.recorded, self.thrown.body),)
 
     def candidate(self, parameters: np.ndarray, source: Source) -> Candidate:
         """Return the motions of parameters."""

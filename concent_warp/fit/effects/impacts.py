@@ -72,7 +72,7 @@ def impact_deviations(
         cfg: Settings.
         begun: Error of the window's initial state, shape (2 nv,); none by default.
     """
-    w, values, m = prediction.windows[window], prediction.start, prediction.compiled
+    w, values, m = prediction.windows[window], prediction.start, prediction.compiled_in(window)
     none = np.zeros((w.count, 0))
     if not cfg.impact_error:
         return none
@@ -175,12 +175,23 @@ def _center_velocity(m: mujoco.MjModel, body: int, orientation: np.ndarray, qvel
         orientation: Quaternions wxyz first, shape (T, 4 or more).
         qvel: Linear velocity of its frame's origin, world frame, and angular velocity, body frame, shape (T, 6).
     """
-    arm, found = m.body_ipos[body], qvel[:, :3].copy()
+    arm, found = _center_of_mass(m, body), qvel[:, :3].copy()
     moved = np.cross(qvel[:, 3:], arm)
     turned = np.empty(3)
     for k, quaternion in enumerate(orientation[:, :4]):
         mujoco.mju_rotVecQuat(turned, moved[k], quaternion)
         found[k] += turned
+    return found
+
+
+def _center_of_mass(m: mujoco.MjModel, body: int) -> np.ndarray:
+    """Return the centre of mass of a free body and of what is fixed to it [m], in the frame of the body, shape (3,)."""
+    data, turned = mujoco.MjData(m), np.zeros(4)
+    mujoco.mj_kinematics(m, data)
+    mujoco.mj_comPos(m, data)
+    mujoco.mju_negQuat(turned, data.xquat[body])
+    found = np.zeros(3)
+    mujoco.mju_rotVecQuat(found, data.subtree_com[body] - data.xpos[body], turned)
     return found
 
 

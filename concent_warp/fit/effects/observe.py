@@ -191,7 +191,7 @@ def keeps_close(
         velocities[row] += offset[m.nv :]
     every = max(int(0.01 / m.opt.timestep), 1)
     record = np.arange(0, steps + 1, every)
-    simulator = make_engine(engine, source.model)
+    simulator = make_engine(engine, source.model.with_payloads(d.payloads))
     variants = Variants(len(offsets), qpos=positions, qvel=velocities)
     rollout = simulator.run(variants, commands(m, d, steps, start), record=record, bodies=[]).numpy()
     curved = np.zeros(len(record))

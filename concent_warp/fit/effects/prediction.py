@@ -23,6 +23,12 @@ from concent_warp.simulate.select import EngineName, make_engine
 if TYPE_CHECKING:
     from concent_warp.fit.effects.observation import Window
     from concent_warp.model import Model
+    from concent_warp.scene.payloads import Payload
+
+EngineKey = tuple[tuple[float, ...], tuple["Payload", ...]]
+"""What the compiled model depends on: the parameters that enter the MJCF, and payloads."""
+MAX_ENGINES = 8
+"""Engines that are kept for other such values."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +130,7 @@ class Prediction:
                 self.prior_mean[part] = [p.null for p in self.parameters[part]]
         self._engine_name: EngineName = engine
         self._threads = threads
-        self._engines: dict[tuple[float, ...], tuple[Engine, mujoco.MjModel]] = {}
+        self._engines: dict[EngineKey, tuple[Engine, mujoco.MjModel]] = {}
         self._edits = [i for i, e in enumerate(self.effects) if e.edits]
         free = self._base.scene.model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
         self._moves_freely = bool(free.any())
@@ -148,7 +154,11 @@ class Prediction:
     @property
     def compiled(self) -> mujoco.MjModel:
         """The compiled model at the start values, prepared for the effects."""
-        return self._engine(self.start)[0].compiled
+        return self._engine(self._engine_key(self.start))[0].compiled
+
+    def compiled_in(self, window: int) -> mujoco.MjModel:
+        """Return the same with the payloads of a window's demonstration."""
+        return self._engine(self._engine_key(self.start, window))[0].compiled
 
     def only(self, windows: Sequence[int]) -> Prediction:
         """Return the prediction of some of the windows, with a memory of its own."""
@@ -170,13 +180,19 @@ class Prediction:
             added.append(AddedEffect(e, chosen, tuple(intervals[part]), posterior, first))
         return replace(self._base, effects=tuple(added))
 
-    def _engine(self, values: np.ndarray) -> tuple[Engine, mujoco.MjModel]:
-        """Return the engine for the values that enter the MJCF, and the model before effects write their fields."""
-        key = tuple(float(v) for i in self._edits for v in values[self.split[i]])
+    def _engine_key(self, values: np.ndarray, window: int | None = None) -> EngineKey:
+        """Return the values that enter the MJCF, all others at the start, and the payloads of a window."""
+        chosen = self.start.copy()
+        for i in self._edits:
+            chosen[self.split[i]] = values[self.split[i]]
+        return tuple(chosen.tolist()), () if window is None else self.windows[window].demonstration.payloads
+
+    def _engine(self, key: EngineKey) -> tuple[Engine, mujoco.MjModel]:
+        """Return an engine, and the model before effects write their fields."""
         if key not in self._engines:
-            if len(self._engines) > 8:
+            if len(self._engines) > MAX_ENGINES:
                 self._engines.pop(next(iter(self._engines)))
-            model = self.model(values)
+            model = self.model(np.array(key[0])).with_payloads(key[1])
             limited = self._threads is not None and self._engine_name == "mujoco"
             engine: Engine = (
                 MujocoEngine(model, threads=self._threads) if limited else make_engine(self._engine_name, model)
@@ -207,14 +223,13 @@ class Prediction:
     def courses(self, trials: Sequence[SimulationRequest], time: float | None = None) -> list[Course]:
         """Simulate trials, each to the end of its window or for some time [s] only."""
         courses: list[Course | None] = [None] * len(trials)
-        groups: dict[tuple[float, ...], list[int]] = {}
+        groups: dict[EngineKey, list[int]] = {}
         steps = [self._steps(trial.window, time) for trial in trials]
         for i, trial in enumerate(trials):
-            key = tuple(float(v) for e in self._edits for v in trial.values[self.split[e]])
-            groups.setdefault(key, []).append(i)
-        for alike in groups.values():
+            groups.setdefault(self._engine_key(trial.values, trial.window), []).append(i)
+        for key, alike in groups.items():
             for members in of_similar_length(alike, steps, self.cfg.call_steps):
-                engine, bare = self._engine(trials[members[0]].values)
+                engine, bare = self._engine(key)
                 simulated = self._simulate(engine, bare, [trials[i] for i in members], [steps[i] for i in members])
                 for i, course in zip(members, simulated, strict=True):
                     courses[i] = course

@@ -80,7 +80,8 @@ def touches(model: Model, w: Window, engine: EngineName) -> bool | None:
         ctrl = commands(model.compile(), w.demonstration, steps, w.start)
     except RecordingError:
         return None
-    rollout = make_engine(engine, model).run(start, ctrl, record=[0], bodies=[], contacts="touched").numpy()
+    simulator = make_engine(engine, model.with_payloads(w.demonstration.payloads))
+    rollout = simulator.run(start, ctrl, record=[0], bodies=[], contacts="touched").numpy()
     return bool(rollout.diverged.any() or rollout.touched.any())
 
 

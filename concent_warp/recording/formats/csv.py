@@ -10,6 +10,9 @@ A folder holds ``scene.xml`` and, either in itself or in ``demo_*`` subfolders (
   one of its numbers; of an orientation of a component of the rotation vector [rad]. Beside ``scene.xml`` it holds for
   all demonstrations.
 
+- ``payloads.csv``, optional: below a header ``body,mass,x,y,z``, or ``body,mass,x,y,z,ixx,iyy,izz``, a row for each
+  known weight that a body carried and the scene does not have, see `Payload`.
+
 Cells are SI numbers with a decimal point, separated by commas; an empty cell is a missing value. A ``/`` in a name is
 written as ``%2F`` in the file's name. Files of other kinds are left alone.
 """
@@ -32,11 +35,13 @@ from concent_warp.recording.naming import PREFIX, by_number, name_of
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.validation.validate import validate
+from concent_warp.scene.payloads import PAYLOAD_HEADER, PAYLOAD_NUMBERS, Payload
 from concent_warp.scene.scene import Scene
 
 SCENE = "scene.xml"
 INITIAL = "initial.csv"
 NOISE = "noise.csv"
+PAYLOADS = "payloads.csv"
 
 
 def read_csv(folder: Path) -> Recording:
@@ -108,6 +113,7 @@ def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstra
     measured: dict[str, Channel] = {}
     state: dict[str, np.ndarray] = {}
     noise: dict[str, float] = {}
+    payloads: tuple[Payload, ...] = ()
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise RecordingError(
@@ -127,6 +133,8 @@ def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstra
             state = _read_state(path)
         elif path.name == NOISE:
             noise = _read_noise(path)
+        elif path.name == PAYLOADS:
+            payloads = tuple(_read_payloads(path))
         elif kind == "measured" and channel:
             header, table = _read_table(path)
             order = column_order(path, header[1:], m, name_of(channel))
@@ -143,10 +151,10 @@ def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstra
             raise RecordingError(
                 "a CSV file has a name that says nothing",
                 where=path,
-                expected=f"measured_<sensor>.csv, action_<actuator>.csv, {INITIAL} or {NOISE}",
+                expected=f"measured_<sensor>.csv, action_<actuator>.csv, {INITIAL}, {NOISE} or {PAYLOADS}",
                 fix="rename it or take it out of the folder",
             )
-    found = Demonstration(name=name, action=action, measured=measured, qpos=state.get("qpos"), qvel=state.get("qvel"))
+    found = Demonstration(name, "", None, state.get("qpos"), state.get("qvel"), action, measured, payloads=payloads)
     return _with_noise((found,), noise, folder / NOISE)[0]
 
 
@@ -178,6 +186,29 @@ def _read_noise(path: Path) -> dict[str, float]:
         if not (np.isfinite(noise[name]) and noise[name] > 0):
             raise RecordingError("noise makes no sense", where=where, expected="a number above 0", found=cells[1][:40])
     return noise
+
+
+def _read_payloads(path: Path) -> Iterator[Payload]:
+    """Read the weights that bodies carried: rows below a header, see the module."""
+    header: tuple[str, ...] = ()
+    for line, cells in _read_rows(path):
+        if not header:
+            header = tuple(cell.strip().lower() for cell in cells)
+            if header not in (PAYLOAD_HEADER, PAYLOAD_HEADER[:5]):
+                raise RecordingError(
+                    "the header row is missing",
+                    where=f"{path}, line {line}",
+                    expected=f"{','.join(PAYLOAD_HEADER)}, with or without the last three",
+                    found=repr(",".join(cells))[:80],
+                )
+            continue
+        if len(cells) != len(header):
+            where = f"{path}, line {line}"
+            raise RecordingError(
+                "a row has the wrong number of cells", where=where, expected=len(header), found=len(cells)
+            )
+        numbers = [_number(cell, path, line, column) for cell, column in zip(cells[1:], header[1:], strict=True)]
+        yield Payload.of(cells[0].strip(), [*numbers, *[0.0] * (PAYLOAD_NUMBERS - len(numbers))])
 
 
 def _read_table(path: Path) -> tuple[list[str], np.ndarray]:

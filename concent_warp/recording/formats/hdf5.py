@@ -21,6 +21,7 @@ from concent_warp.recording.naming import by_number, entry_of, name_of
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, PolicyLog, Recording
 from concent_warp.recording.time_zero import counted_from_first_sample
 from concent_warp.recording.validation.validate import validate
+from concent_warp.scene.payloads import PAYLOAD_NUMBERS, Payload
 from concent_warp.scene.scene import Scene
 
 FORMAT = "concent-recording"
@@ -100,6 +101,9 @@ def _write_file(file: h5py.File, recording: Recording) -> None:
         for kind in ("action", "measured", "points", "image"):
             for name, stream in getattr(demonstration, kind).items():
                 _write_stream(group.require_group(kind).create_group(entry_of(name)), stream)
+        for body in dict.fromkeys(payload.body for payload in demonstration.payloads):
+            rows = np.array([payload.numbers for payload in demonstration.payloads if payload.body == body])
+            sign(group.require_group("payloads").create_dataset(entry_of(body), data=rows))
         if demonstration.policy is not None:
             log = group.create_group("policy")
             for name in ("time", "observation", "action"):
@@ -208,7 +212,9 @@ class Reader(SafeFile):
 
     def demonstration(self, group: h5py.Group, name: str) -> Demonstration:
         """Read one demonstration."""
-        self.refuse_unknown(group, {"initial", "action", "measured", "points", "image", "policy"}, {"task", "success"})
+        self.refuse_unknown(
+            group, {"initial", "action", "measured", "points", "image", "policy", "payloads"}, {"task", "success"}
+        )
         success = self.attribute(group, "success")
         if success is not None and (np.shape(success) != () or success not in (0, 1)):
             raise self.error("success is not a truth value", group.name, expected="true or false", found=success)
@@ -226,6 +232,7 @@ class Reader(SafeFile):
             points=self.streams(group, "points", self.points),
             image=self.streams(group, "image", self.image),
             policy=self.policy(self.group(group, "policy")) if "policy" in group else None,
+            payloads=self.payloads(self.group(group, "payloads")) if "payloads" in group else (),
             **state,
         )
 
@@ -264,6 +271,21 @@ class Reader(SafeFile):
         names = ("time", "observation", "action")
         self.refuse_unknown(group, set(names))
         return PolicyLog(*(self.array(group, name) for name in names))
+
+    def payloads(self, group: h5py.Group) -> tuple[Payload, ...]:
+        """Read what bodies carried: by body a row of `Payload.numbers` for each weight."""
+        found = []
+        for name in group:
+            rows = self.array(group, str(name))
+            if rows.ndim != 2 or rows.shape[1] != PAYLOAD_NUMBERS:
+                raise self.error(
+                    "not rows of payloads",
+                    f"{group.name}/{name}",
+                    expected=f"{PAYLOAD_NUMBERS} numbers each: mass, position and moments of inertia",
+                    found=rows.shape,
+                )
+            found += [Payload.of(name_of(str(name)), row) for row in rows]
+        return tuple(found)
 
     def points(self, group: h5py.Group) -> PointTrack:
         """Read the point track of one body."""

@@ -34,6 +34,7 @@ from concent_warp.recording.validation.magnitudes import (
     check_positions,
 )
 from concent_warp.recording.validation.scene_text import check_scene_text
+from concent_warp.scene.payloads import Payload
 from concent_warp.scene.scene import Scene
 
 QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
@@ -98,10 +99,31 @@ def _check_demonstration(
     for name, stream in demonstration.image.items():
         _check_time(stream.time, place.at(f"image/{name}"))
         check_image(stream, model, place.at(f"image/{name}"), cfg)
+    for payload in demonstration.payloads:
+        _check_payload(payload, model, place.at(f"payloads/{payload.body}"))
     if demonstration.policy is not None:
         _check_policy(demonstration.policy, place.at("policy"))
     check_clocks(demonstration, place, cfg.clocks)
     _check_duration(demonstration, model.opt.timestep, place)
+
+
+def _check_payload(payload: Payload, model: mujoco.MjModel, place: ErrorLocation) -> None:
+    """Check that a body that moves carries a payload, and that its numbers make sense."""
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, payload.body)
+    moving = [model.body(b).name for b in range(model.nbody) if model.body_weldid[b]]
+    if body < 0 or not model.body_weldid[body]:
+        raise place.error("a payload on nothing that moves", expected=f"one of {moving}", found=payload.body)
+    if not (0 < payload.mass < MAX_MAGNITUDE):
+        raise place.error("the mass of a payload makes no sense", expected="a number above 0", found=payload.mass)
+    if not np.all(np.abs(payload.position) < MAX_MAGNITUDE):
+        raise place.error("the position of a payload makes no sense", found=list(payload.position))
+    moments = np.array(payload.inertia)
+    if not (np.all((moments >= 0) & (moments < MAX_MAGNITUDE)) and 2 * moments.max() <= moments.sum() * (1 + 1e-9)):
+        raise place.error(
+            "no body has such moments of inertia",
+            expected="three numbers, none below 0, and none above the sum of the others",
+            found=list(payload.inertia),
+        )
 
 
 def _check_duration(demonstration: Demonstration, timestep: float, place: ErrorLocation) -> None:

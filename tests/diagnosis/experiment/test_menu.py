@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnosis.experiment.cfg import MotionMenuCfg
-from concent_warp.diagnosis.experiment.joint_motions import Drives, _above, _payload_links, _top_speed, drive_motions
+from concent_warp.diagnosis.experiment.joint_motions import Drives, _top_speed, drive_motions
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, _unchanged, slope_turned
 from concent_warp.diagnosis.experiment.object_motions import ThrowableBody, _roll, body_motions
+from concent_warp.diagnosis.experiment.payloads import _above, payload_links, payload_text
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -272,14 +273,13 @@ def test_objects_are_turned_or_heavier_while_commands_are_repeated():
         np.testing.assert_array_equal(motion.qvel, qvel)
         assert motion.duration == known.longest.duration
         assert motion.action is known.longest.action
-    (heavy,) = made["repeat, heavier"]
-    assert heavy.text == "with 50 % more mass on block, repeat the same commands"
-    changed = heavy.change(known.model).compile()
-    assert changed.body("block_payload").mass == pytest.approx(0.15)
-    assert changed.geom_size[changed.body_geomadr[changed.body("block_payload").id], 0] == 0.01
-    (first,) = made["slide, heavier"]
-    assert first.text == f"with 50 % more mass on block, {made['slide'][0].text}"
-    assert first.change(known.model).compile().body("block_payload").mass == pytest.approx(0.15)
+    (heavy,) = made["repeat with payload"]
+    assert heavy.text == f"with {payload_text(heavy.payloads)}, repeat the same commands"
+    assert [(p.body, p.mass) for p in heavy.payloads] == [("block", pytest.approx(0.15))] * 2
+    (first,), (spin,) = made["slide with payload"], made["spin in place with payload"]
+    assert first.text.endswith(f", {made['slide'][0].text}")
+    assert spin.text.endswith(f", {made['spin in place'][1].text}")
+    assert first.payloads == heavy.payloads
     assert "slide, turned table" not in made
     (table,) = by_name(body_motions(known, "mujoco", tilted=True))["slide, turned table"]
     assert table.text.startswith("turn the table by 180 deg, so that its slope runs the other way, and push block off")
@@ -443,16 +443,18 @@ def test_payloads_are_put_on_the_last_link_that_the_drives_carry():
     known = bench()
     drives = Drives.of(known)
     assert drives is not None
-    assert _payload_links(known, drives) == ["hand"]
+    assert payload_links(known, drives.ids) == ["hand"]
     hand, rail = known.m.body("hand").id, known.m.body("rail").id
     assert _above(known.m, hand) == {0, rail, hand}
-    assert _payload_links(known, replace(drives, ids=(2,))) == ["hand"]
+    assert payload_links(known, (2,)) == ["hand"]
     made = drive_menu(known)
     heavy = {name for name in made if name.endswith("with payload")}
     assert heavy == {f"{n} with payload" for n in ("sweeps", "slow reversals", "chirp", "holds")}
     (sweep,) = made["sweeps with payload"]
-    assert sweep.text == f"with 50 % more mass on hand, {made['sweeps'][0].text}"
-    assert sweep.change(known.model).compile().body("hand_payload").mass == pytest.approx(0.1)
+    (payload,) = sweep.payloads
+    assert sweep.text == f"with {payload_text((payload,))}, {made['sweeps'][0].text}"
+    assert (payload.body, payload.mass) == ("hand", pytest.approx(0.2))
+    assert payload.position == pytest.approx(tuple(known.m.body_ipos[hand]), abs=1e-3)
 
 
 def test_scenes_without_actuators_have_no_motions_of_drives():
@@ -464,4 +466,4 @@ def test_scenes_without_actuators_have_no_motions_of_drives():
     assert list(drive_motions(loose, tilted=True)) == []
     names = set(by_name(body_motions(loose, "mujoco", tilted=False)))
     assert "slide" in names
-    assert "repeat, heavier" not in names
+    assert "repeat with payload" not in names

@@ -3,8 +3,9 @@ import pytest
 
 from concent_warp.diagnosis.experiment.cfg import MotionMenuCfg
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
-from concent_warp.diagnosis.experiment.motions import RecordedRange, heavier, slope_turned
+from concent_warp.diagnosis.experiment.motions import RecordedRange, slope_turned
 from concent_warp.diagnosis.experiment.object_motions import ThrowableBody, _roll, body_motions
+from concent_warp.diagnosis.experiment.payloads import on_object
 from concent_warp.effects.library.world import AirDrag, GravityTilt
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -97,19 +98,15 @@ def test_turned_table_slopes_the_other_way_and_leaves_other_effects():
     assert [a.values for a in turned.effects] == [(-0.01, 0.02), (3.0,)]
 
 
-@pytest.mark.parametrize("body", ["block", "hand"])
-def test_payload_adds_mass_at_the_centre_of_mass_and_nothing_else(body):
-    model = Model(Scene(XML.format(shape=BOX))).add(AirDrag("block"), [3.0])
-    plain, heavy = model.compile(), heavier(body, MotionMenuCfg())(model).compile()
-    row = plain.body(body).id
-    assert heavy.body_subtreemass[0] == pytest.approx(
-        plain.body_subtreemass[0] + MotionMenuCfg().extra_mass * plain.body_mass[row]
-    )
-    payload = heavy.body(f"{body}_payload")
-    np.testing.assert_allclose(payload.pos, plain.body_ipos[row])
-    assert heavy.nq == plain.nq
-    assert heavy.nu == plain.nu
-    assert heavy.opt.density == 3.0
+def test_an_object_carries_two_weights_on_opposite_sides_that_lie_level():
+    known = bench()
+    body = known.m.body("block").id
+    one, other = on_object(known, body)
+    centre, each = known.m.body_ipos[body], 0.5 * MotionMenuCfg().extra_mass * known.m.body_mass[body]
+    assert one.mass == other.mass == pytest.approx(each)
+    np.testing.assert_allclose(np.add(one.position, other.position) / 2, centre, atol=1e-3)
+    assert np.linalg.norm(np.subtract(one.position, other.position)) > 0.01
+    assert one.position[2] == other.position[2]
 
 
 def test_object_is_launched_from_where_it_rests():

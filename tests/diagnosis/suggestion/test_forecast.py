@@ -63,10 +63,21 @@ def test_unknown_initial_states_take_up_evidence():
 
 def test_scores_grow_with_the_least_of_the_evidence():
     found = forecast(friction_or_damping(RECORDING), motion(0.02))
-    assert found.score(1.0) > found.score(10.0)
+    assert found.score(1.0, 0.01) > found.score(10.0, 0.01)
     confused = found.evidence.copy()
     confused[0, 1] = 0.0
-    assert type(found)(confused, found.separation, found.channels, found.count).score(1.0) < found.score(1.0)
+    assert type(found)(confused, found.separation, found.channels, found.count).score(1.0, 0.01) < found.score(
+        1.0, 0.01
+    )
+
+
+def test_evidence_of_many_readings_by_a_small_difference_counts_less():
+    found = forecast(friction_or_damping(RECORDING), motion(0.02))
+    least = min(found.separation[0, 1], found.separation[1, 0])
+    assert found.score(1.0, 0.5 * least) == found.score(1.0, least) > found.score(1.0, 10 * least)
+    assert found.decides(1e-6, least)
+    assert not found.decides(1e-6, 1.01 * least)
+    assert not found.decides(1e9, least)
 
 
 def test_what_courses_tell_is_not_simulated_again(monkeypatch):

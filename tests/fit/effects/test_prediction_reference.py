@@ -171,9 +171,9 @@ def test_effects_reach_back_whole_steps_and_threads_are_those_asked_for(recordin
     m = prediction.compiled
     assert prediction._before(m) == int(np.ceil(delayed.history / 0.005))
     assert Prediction(drawing(recording), (), windows)._before(m) == 0
-    engine: Any = prediction._engine(prediction.start)[0]
+    engine: Any = prediction._engine(prediction._engine_key(prediction.start))[0]
     assert engine.threads == 1
-    free: Any = Prediction(drawing(recording), (delayed,), windows)._engine(prediction.start)[0]
+    free: Any = Prediction(drawing(recording), (delayed,), windows)._engine((tuple(prediction.start.tolist()), ()))[0]
     assert free.threads == MujocoEngine(drawing(recording)).threads
 
 
@@ -190,11 +190,11 @@ def test_models_that_were_compiled_are_kept_up_to_nine(recording, windows):
     edited = effect_class("joint_damping")("hinge")
     prediction = Prediction(drawing(recording), (edited,), windows)
     prediction._edits = [0]  # as if the damping had to be compiled in
-    values = [np.array([0.001 * k]) for k in range(10)]
-    engines = [prediction._engine(v)[0] for v in values[:9]]
-    assert all(prediction._engine(v)[0] is e for v, e in zip(values, engines, strict=False))
-    prediction._engine(values[9])
-    assert list(prediction._engines) == [(float(v[0]),) for v in values[1:]]
+    keys = [prediction._engine_key(np.array([0.001 * k])) for k in range(10)]
+    engines = [prediction._engine(key)[0] for key in keys[:9]]
+    assert all(prediction._engine(key)[0] is e for key, e in zip(keys, engines, strict=False))
+    prediction._engine(keys[9])
+    assert list(prediction._engines) == keys[1:] == [((0.001 * k,), ()) for k in range(1, 10)]
 
 
 def test_a_simulation_that_diverges_is_lost_by_a_large_residual(recording, windows):
