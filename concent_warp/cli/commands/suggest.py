@@ -63,6 +63,8 @@ class Arguments:
     max_interval: Positive = SuggestCfg.max_interval
     """Half the 95 % interval of a parameter over its distance from the null value, above which an effect is not known
     well enough [-]."""
+    payloads: bool = SuggestCfg.payloads
+    """Whether a known weight may be asked for, where no motion without one decides everything."""
     limits: MotionLimitsCfg = field(default_factory=MotionLimitsCfg)
     trajectory: TrajectoryCfg = field(default_factory=TrajectoryCfg)
     engine: EngineOption = "mujoco"
@@ -101,6 +103,7 @@ def run(arguments: Arguments) -> Suggestion:
         evaluations=arguments.evaluations,
         population=arguments.population,
         max_interval=arguments.max_interval,
+        payloads=arguments.payloads,
         seed=arguments.seed,
         limits=arguments.limits,
         trajectory=arguments.trajectory,

@@ -18,7 +18,7 @@ from tests.diagnosis.suggestion.carts import one_speed, open_group
 
 RECORDING = one_speed(friction=0.2)
 MODEL = Model(Scene(RECORDING.scene))
-QUICK = SuggestCfg(evaluations=16, population=8, duration=3.0)
+QUICK = SuggestCfg(payloads=False, evaluations=16, population=8, duration=3.0)
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +108,24 @@ def test_what_one_method_has_simulated_another_one_reads(found, menu, tmp_path, 
     assert again.to_json() == menu.to_json()
 
 
+def test_a_weight_is_asked_for_where_no_motion_is_clear(found, tmp_path):
+    assert min(pair.separation for pair in found.pairs) < SuggestCfg().clear_separation
+    heavy = suggest(MODEL, RECORDING, replace(QUICK, payloads=True), diagnosis=open_group())
+    ((weight,),) = heavy.to_json()["payloads"]
+    assert weight["body"] == "cart"
+    assert f"With {weight['mass']:g} kg at " in heavy.sentence
+    written = heavy.save(tmp_path / "motion.h5")
+    assert [path.name for path in written] == ["motion.h5", "motion.csv", "motion.payloads.csv"]
+    (kept,) = load_recording(written[0])[0].payloads
+    assert (kept.body, kept.mass) == (weight["body"], weight["mass"])
+    assert min(p.separation for p in heavy.pairs) >= min(p.separation for p in found.pairs)
+
+
 def test_nothing_is_searched_where_the_menu_separates_by_far(menu, monkeypatch):
     margin = min(pair.evidence for pair in menu.pairs) / menu.needed
+    assert min(pair.separation for pair in menu.pairs) > 0.01
     monkeypatch.setattr(Search, "optimised", lambda *_: pytest.fail("searched"))
-    enough = replace(QUICK, enough=0.5 * margin)
+    enough = replace(QUICK, enough=0.5 * margin, clear_separation=0.01)
     assert suggest(MODEL, RECORDING, enough, diagnosis=open_group()).to_json() == menu.to_json()
 
 
