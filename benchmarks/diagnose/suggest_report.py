@@ -100,8 +100,9 @@ and drive gain of a pendulum, whose ratio alone acts. A random trajectory is per
     text += """
 ## What this does not show
 
-Measured data; set-ups that are changed (a payload, a turned table), which could separate more; a second suggestion
-after the first; and how much the evidence depends on errors of formulas, which are small in Reality.
+Measured data; known weights on links and objects, which `concent suggest` asks for since 2026-11-30 where no motion
+decides everything: these motions were chosen before; a table that is turned; a second suggestion after the first; and
+how much the evidence depends on errors of formulas, which are small in Reality.
 """
     return text
 
