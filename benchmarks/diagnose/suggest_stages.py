@@ -132,14 +132,15 @@ def _like(folder: Path, method: Method) -> dict[str, str]:
 def _same(first: Recording, second: Recording) -> bool:
     """Return whether two motions are the same."""
     return len(first.demonstrations) == len(second.demonstrations) and all(
-        _arrays(a).keys() == _arrays(b).keys()
+        a.payloads == b.payloads
+        and _arrays(a).keys() == _arrays(b).keys()
         and all(np.array_equal(value, _arrays(b)[name]) for name, value in _arrays(a).items())
         for a, b in zip(first.demonstrations, second.demonstrations, strict=True)
     )
 
 
 def _arrays(d: Demonstration) -> dict[str, np.ndarray]:
-    """Return what makes a motion: where it begins, its duration and its commands."""
+    """Return what makes a motion besides payloads: where it begins, its duration and its commands."""
     found = {"duration": np.array(d.duration)}
     found |= {name: value for name, value in (("qpos", d.qpos), ("qvel", d.qvel)) if value is not None}
     for name, channel in d.action.items():

@@ -96,6 +96,7 @@ def _fingerprint(model: Model, recording: Recording, cfg: DiagnoseCfg, versions:
     _add(digest, model.contact)
     for d in recording.demonstrations:
         _add(digest, [d.name, d.qpos, d.qvel])
+        digest.update(repr(d.payloads).encode())
         for channels in (d.action, d.measured):
             for name, channel in channels.items():
                 _add(digest, [name, channel])

@@ -57,9 +57,14 @@ class Payload:
 
 def fasten(spec: mujoco.MjSpec, payloads: Sequence[Payload]) -> None:
     """Fasten payloads to the bodies of a spec, each a body of its own without a geom: nothing touches it."""
+    taken = {body.name for body in spec.bodies}
     for k, payload in enumerate(payloads):
+        name = f"{payload.body}_payload{k}"
+        while name in taken:
+            name += "_"
+        taken.add(name)
         spec.body(payload.body).add_body(
-            name=f"{payload.body}_payload{k}",
+            name=name,
             pos=payload.position,
             mass=payload.mass,
             ipos=np.zeros(3),  # where it is not given, the MJCF that is written lacks mass and inertia

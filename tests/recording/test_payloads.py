@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import concent_warp as cw
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.checkpoint import _fingerprint
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
@@ -69,6 +71,18 @@ def test_replays_and_windows_of_a_demonstration_have_its_payloads(servo):
         )
     )
     np.testing.assert_allclose(found, expected)
+
+
+def test_a_payload_gets_a_name_that_is_free(servo):
+    scene = cw.Model.from_recording(servo).scene
+    twice = scene_with_payloads(scene_with_payloads(scene, (BOB,)), (BOB,)).model
+    assert [twice.body(b).name for b in range(twice.nbody)][-2:] == ["arm_payload0", "arm_payload0_"]
+
+
+def test_an_interrupted_diagnosis_is_not_continued_with_other_payloads(servo):
+    model = cw.Model.from_recording(servo)
+    of = [_fingerprint(model, r, DiagnoseCfg(), {}) for r in (servo, carrying(servo, BOB), carrying(servo))]
+    assert of[0] == of[2] != of[1]
 
 
 def test_payloads_are_kept_in_a_file(servo, tmp_path):

@@ -121,7 +121,7 @@ def suggest(
     evaluations = Evaluations(None if folder is None else folder / EVALUATIONS_FILE)
     # Fits and ratings are the same whatever they are compared for.
     settings = plain(replace(cfg, method="best"))
-    identity = key_of(model.scene.xml, settings, versions(), engine, *_arrays(recording))
+    identity = key_of(model.scene.xml, settings, versions(), engine, *_arrays(recording), *_carried(recording))
     scaled = lambda share, text: report(begin + (1 - begin) * share, text)  # noqa: E731
     hypotheses = _fitted(question, recording, cfg, engine, evaluations, identity, scaled)
     suggestion = _searched(question, hypotheses, recording, cfg, engine, evaluations, identity, scaled)
@@ -136,12 +136,16 @@ def _ignore(share: float, text: str) -> None:
     del share, text
 
 
+def _carried(recording: Recording) -> list[str]:
+    """Return in words what bodies carried, nothing where they never did."""
+    return [f"{d.name}: {d.payloads}" for d in recording.demonstrations if d.payloads]
+
+
 def _arrays(recording: Recording) -> list[np.ndarray]:
     """Return all numbers of a recording."""
     found = []
     for d in recording.demonstrations:
         found += [a for a in (d.qpos, d.qvel) if a is not None]
-        found += [np.array(payload.numbers) for payload in d.payloads]
         for channels in (d.action, d.measured):
             found += [array for c in channels.values() for array in (c.time, c.value)]
     return [np.ascontiguousarray(a) for a in found]
