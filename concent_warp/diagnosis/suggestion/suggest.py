@@ -317,6 +317,9 @@ def _suggestion(
 def _brings(names: list[str], pairs: tuple[SuggestedPair, ...], needed: float) -> str:
     """Return which hypotheses a motion distinguishes, in a sentence."""
     decided = [pair for pair in pairs if pair.resolved]
+    if not decided:
+        most = max(pair.evidence for pair in pairs)
+        return f"It is expected to decide nothing: it brings {most:.2g} nat at most, of {needed:.2g} needed."
     least = min(pair.evidence for pair in decided)
     if len(decided) == len(pairs):
         return (

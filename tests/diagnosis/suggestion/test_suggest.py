@@ -59,6 +59,13 @@ def test_the_search_does_no_worse_than_the_menu_and_than_chance(found, menu):
     assert least[0] >= 0.99 * max(least)
 
 
+def test_a_motion_by_chance_is_suggested_even_where_it_is_expected_to_decide_nothing():
+    chance = suggest(MODEL, RECORDING, replace(QUICK, method="random", decisive=1e6), diagnosis=open_group())
+    assert chance.found
+    assert not any(pair.resolved for pair in chance.pairs)
+    assert "expected to decide nothing" in chance.sentence
+
+
 def test_nothing_is_suggested_where_no_motion_is_within_the_limits():
     still = replace(QUICK, method="menu", limits=MotionLimitsCfg(workspace=(5, 5, 5, 6, 6, 6)))
     nothing = suggest(MODEL, RECORDING, still, diagnosis=open_group())
