@@ -65,7 +65,7 @@ def commands() -> list[str]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a recording of Reality, of a fast demonstration: how long it is does not matter to the pages."""
     path = tmp_path_factory.mktemp("docs") / "demo.h5"
-    write_hdf5(record(RealityCfg(expert=ExpertCfg(speed=2.0)), [0])[0], path)
+    write_hdf5(record(RealityCfg(expert=ExpertCfg(speed=3.0)), [0])[0], path)
     return path
 
 
