@@ -14,7 +14,7 @@ from benchmarks.robustness.contents import hashes, unfinished, unreadable
 from benchmarks.robustness.page import page
 
 COMMANDS = {writing.name: writing for writing in WRITING}
-QUICK = ("add", "compare")
+QUICK = ("add", pytest.param("compare", marks=pytest.mark.slow))  # which writes as "add" does
 
 
 @pytest.fixture(scope="module")

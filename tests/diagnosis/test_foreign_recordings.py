@@ -55,7 +55,7 @@ def parameters(added: Any, model: cw.Model) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("effects", "seconds"),
+    ("effects", "seconds"),  # all of them are candidates where nothing is missing, below
     [pytest.param((), 6.0, marks=pytest.mark.slow, id="all"), pytest.param(RIVALS_OF_DELAY, 3.0, id="rivals")],
 )
 def test_damping_and_delay_of_an_arm_are_found_where_noise_is_not_stated(tmp_path, effects, seconds):
