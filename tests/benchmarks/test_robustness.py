@@ -45,7 +45,7 @@ def test_of_two_at_once_one_succeeds(inputs):
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_diagnosis_killed_at_a_late_moment_gives_the_same_result(inputs, tmp_path, jobs):
-    writing = Writing("diagnose", killed.DIAGNOSE.replace("--jobs 2", f"--jobs {jobs}"))
+    writing = Writing("diagnose", killed.DIAGNOSE.replace("--jobs 2", f"--jobs {jobs}").replace(" backlash", ""))
     diagnose = replace(killed.KILLABLE["diagnose"], writing=writing)
     assert f"--jobs {jobs}" in diagnose.writing.line
     (tmp_path / "out").mkdir()
