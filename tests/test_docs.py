@@ -78,7 +78,7 @@ def film() -> Callable:
 
     @cache
     def recorded(cfg: RealityCfg, seeds: tuple[int, ...]):
-        return record(replace(cfg, expert=replace(cfg.expert, speed=3.0)), seeds)
+        return record(replace(cfg, expert=replace(cfg.expert, speed=3.0)), list(seeds))
 
     return lambda cfg, seeds: recorded(cfg, tuple(seeds))
 
