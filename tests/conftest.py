@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 LONG = (
-    *("test_examples.py", "test_foreign_recordings.py", "test_docs.py", "test_front_door.py", "test_distil.py"),
-    *("test_flow_policy.py", "test_cli_play.py", "test_robustness.py", "test_train.py", "test_docs_site.py"),
-    *("test_springs.py", "test_flow_at_work.py", "test_time_budget.py", "test_disk_full.py", "test_bad_input.py"),
-    *("test_render_commands.py", "test_calibrate_by_tags.py", "test_report_browser.py", "test_suggest.py"),
-    *("test_independent_worlds.py", "test_foreign_contact.py", "test_data_parallel.py", "test_cli_diagnose.py"),
-    *("test_overflow.py", "test_nominal_values.py", "test_softer_contacts.py", "test_foreign.py"),
+    *("test_drake_world.py", "test_bullet_world.py", "test_docs.py", "test_examples.py", "test_front_door.py"),
+    *("test_cli_play.py", "test_distil.py", "test_foreign_recordings.py", "test_train.py", "test_robustness.py"),
+    *("test_docs_site.py", "test_flow_at_work.py", "test_flow_policy.py", "test_springs.py", "test_suggest.py"),
+    *("test_calibrate_by_tags.py", "test_foreign_contact.py", "test_time_budget.py", "test_render_commands.py"),
+    *("test_independent_worlds.py", "test_bad_input.py", "test_data_parallel.py", "test_report_browser.py"),
+    *("test_softer_contacts.py", "test_nominal_values.py", "test_overflow.py", "test_foreign.py"),
+    *("test_cli_diagnose.py", "test_disk_full.py", "test_rough_impacts.py"),
 )
 """Files of more than a quarter of a minute, the longest first."""
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")

@@ -30,8 +30,8 @@ def test_cases_cover_all_commands_and_differ():
 
 @pytest.mark.timeout(300)
 def test_a_part_of_the_cases_goes_as_required(tmp_path):
-    """Every 36th case; a process of its own forks for each, without the threads of other tests."""
-    command = [sys.executable, "-m", "benchmarks.bad_input", "--sample", "36", "--examples", "0"]
+    """Every 60th case; a process of its own forks for each, without the threads of other tests."""
+    command = [sys.executable, "-m", "benchmarks.bad_input", "--sample", "60", "--examples", "0"]
     command += ["--output", str(tmp_path / "page.md")]
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, env=os.environ | {"OMP_NUM_THREADS": "1"}

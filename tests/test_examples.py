@@ -85,7 +85,7 @@ def test_recording_that_comes_with_the_package_is_listed(run):
 
 
 def test_the_block_is_tracked_as_it_is_lifted(run):
-    said = run("steps/track_objects.py", "--seconds", 3, "--rate", 6)
+    said = run("steps/track_objects.py", "--seconds", 3, "--rate", 4)
     ((moved, error),) = re.findall(r"^block: moved by ([\d.]+) cm, error ([\d.]+) mm$", said, re.M)
     assert float(moved) > 3
     assert float(error) < 0.5

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import shlex
 import shutil
-import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -100,9 +101,21 @@ def test_the_front_page_shows_the_same_figures():
     assert "](docs/images/hidden_effect.png)" in front
 
 
-def test_the_recording_is_what_its_script_makes(tmp_path):
+@pytest.fixture
+def run(monkeypatch) -> Callable[..., None]:
+    """Return a function that runs a script with arguments, in this process."""
+
+    def run(script: Path, *arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", [str(script), *map(str, arguments)])
+        monkeypatch.syspath_prepend(script.parent)
+        runpy.run_path(str(script), run_name="__main__")
+
+    return run
+
+
+def test_the_recording_is_what_its_script_makes(run, tmp_path):
     script = ROOT / "examples" / "hidden_effect" / "make.py"
-    subprocess.run([sys.executable, script, tmp_path], check=True, timeout=240)
+    run(script, tmp_path)
     made, kept = load_recording(tmp_path / "demo.h5"), load_recording(script.parent / "demo.h5")
     assert made.scene == kept.scene
     (one,), (other,) = made.demonstrations, kept.demonstrations
@@ -113,12 +126,12 @@ def test_the_recording_is_what_its_script_makes(tmp_path):
     assert (script.parent / "demo.h5").stat().st_size < 300_000
 
 
-def test_the_picture_is_drawn_from_a_diagnosis(printed, tmp_path):
+def test_the_picture_is_drawn_from_a_diagnosis(run, printed, tmp_path):
     folder = Path(printed["folder"])
     effect = {"name": "joint_friction", "step": 0, "accepted": True, "gain": {"value": 0.9, "interval": [0.8, 0.95]}}
     (tmp_path / "found.json").write_text(json.dumps({"effects": [effect]}))
     script = ROOT / "examples" / "hidden_effect" / "picture.py"
     models = [folder / "scene.xml", folder / "with_friction.toml"]
     arguments = [tmp_path / "found.json", folder / "demo.h5", *models, tmp_path / "p.png"]
-    subprocess.run([sys.executable, script, *arguments], check=True, timeout=240)
+    run(script, *arguments)
     assert (tmp_path / "p.png").stat().st_size > 10_000

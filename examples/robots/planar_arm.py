@@ -45,9 +45,9 @@ WITH_HOSE = ARM.replace('name="elbow"/>', 'name="elbow" damping="0.4"/>', 1)
 
 
 def motion() -> np.ndarray:
-    """Return commands [rad] of three seconds, shape (1500, 2)."""
-    time = 0.002 * np.arange(1500)
-    envelope = np.sin(np.pi * time / 3.0)
+    """Return commands [rad] of two seconds, shape (1000, 2)."""
+    time = 0.002 * np.arange(1000)
+    envelope = np.sin(np.pi * time / 2.0)
     return np.stack([0.8 * envelope * np.sin(5 * time), 0.9 * envelope * np.sin(8 * time)], axis=1)
 
 

@@ -73,10 +73,10 @@ HOME = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.2])
 
 
 def motion() -> np.ndarray:
-    """Return commands [rad] of three seconds, shape (1500, 6): a sine for each joint, started and ended softly."""
-    time = 0.002 * np.arange(1500)[:, None]
+    """Return commands [rad] of two seconds, shape (1000, 6): a sine for each joint, started and ended softly."""
+    time = 0.002 * np.arange(1000)[:, None]
     rates = np.array([0.5, 0.7, 0.9, 1.1, 1.3, 1.5])
-    return HOME + 0.35 * np.sin(np.pi * time / 3.0) * np.sin(2 * np.pi * rates * time)
+    return HOME + 0.35 * np.sin(np.pi * time / 2.0) * np.sin(2 * np.pi * rates * time)
 
 
 def main() -> None:

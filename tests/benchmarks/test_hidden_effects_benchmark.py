@@ -32,7 +32,10 @@ def diagnosed(data, case, effects=()):
     ("name", "effects", "above"),
     # Over the short windows of a free body, errors of the initial states hide most of a wrong scale.
     [
-        pytest.param("pendulum-joint_friction-middle-0", (), 1.5, id="friction among all effects"),
+        # Among all effects, the friction of a joint is found in tests/test_examples.py too.
+        pytest.param(
+            "pendulum-joint_friction-middle-0", (), 1.5, id="friction among all effects", marks=pytest.mark.slow
+        ),
         pytest.param(
             "drop-length_scale-middle-0", RIVALS, 1.1, id="scale of lengths among its rivals", marks=pytest.mark.slow
         ),

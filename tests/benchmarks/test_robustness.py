@@ -14,7 +14,7 @@ from benchmarks.robustness.contents import hashes, unfinished, unreadable
 from benchmarks.robustness.page import page
 
 COMMANDS = {writing.name: writing for writing in WRITING}
-QUICK = ("add", "compare")
+QUICK = ("add", pytest.param("compare", marks=pytest.mark.slow))  # which writes as "add" does
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_of_two_at_once_one_succeeds(inputs):
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_diagnosis_killed_at_a_late_moment_gives_the_same_result(inputs, tmp_path, jobs):
-    writing = Writing("diagnose", killed.DIAGNOSE.replace("--jobs 2", f"--jobs {jobs}"))
+    writing = Writing("diagnose", killed.DIAGNOSE.replace("--jobs 2", f"--jobs {jobs}").replace(" backlash", ""))
     diagnose = replace(killed.KILLABLE["diagnose"], writing=writing)
     assert f"--jobs {jobs}" in diagnose.writing.line
     (tmp_path / "out").mkdir()

@@ -1,4 +1,6 @@
+import io
 import json
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 
 import h5py
@@ -41,6 +43,15 @@ def diagnose(path, *arguments):
     return main(["diagnose", str(path), *FEW, *arguments])
 
 
+@pytest.fixture(scope="module")
+def told(swing) -> tuple[str, str]:
+    """What a diagnosis that saves the model as m.toml and a report as r.html prints, on both streams."""
+    given = ["--model", str(swing / "scene.xml"), "--apply", str(swing / "new" / "m.toml")]
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert diagnose(swing / "demo.h5", *given, "--html", str(swing / "r.html")) == 0
+    return out.getvalue(), err.getvalue()
+
+
 def with_angle(path, channel):
     recording = swung(seconds=1.0)
     (d,) = recording.demonstrations
@@ -61,9 +72,8 @@ def angle():
     return swung(seconds=1.0).demonstrations[0].measured["angle"]
 
 
-def test_the_verdict_is_reported_in_sentences_with_a_table(swing, capsys):
-    assert diagnose(swing / "demo.h5", "--model", str(swing / "scene.xml")) == 0
-    said = capsys.readouterr().out
+def test_the_verdict_is_reported_in_sentences_with_a_table(told):
+    said, _ = told
     assert "An effect is missing, and the data identify it" in said
     assert "Missing: joint_damping (damping[hinge] 0.0" in said
     assert "Where the model as given fails" in said
@@ -79,14 +89,13 @@ def test_json_is_one_object_and_nothing_else(swing, capsys):
     assert document["seed"] == 0
 
 
-def test_apply_saves_the_model_with_what_was_accepted(swing, tmp_path, capsys):
-    out = tmp_path / "new" / "m.toml"
-    assert diagnose(swing / "demo.h5", "--apply", str(out)) == 0
+def test_apply_saves_the_model_with_what_was_accepted(swing, told, capsys):
+    out = swing / "new" / "m.toml"
     (added,) = Model.load(out).effects
     assert added.effect.name == "joint_damping"
     ((low, high),) = added.intervals
     assert low < DAMPING < high
-    assert str(out) in capsys.readouterr().out
+    assert str(out) in told[0]
     assert diagnose(swing / "demo.h5", "--apply", str(out)) == 2
     assert "--overwrite" in capsys.readouterr().err
 
@@ -156,9 +165,9 @@ def test_where_nothing_explains_the_data_it_says_that_no_effect_was_accepted(
     assert not out.exists()
 
 
-def test_a_report_shows_the_diagnosis_before_and_after(swing, tmp_path):
-    assert diagnose(swing / "demo.h5", "--html", str(tmp_path / "r.html")) == 0
-    page = (tmp_path / "r.html").read_text()
+@pytest.mark.usefixtures("told")
+def test_a_report_shows_the_diagnosis_before_and_after(swing):
+    page = (swing / "r.html").read_text()
     assert "What is missing" in page
     assert "joint damping" in page
     assert "before" in page
@@ -255,9 +264,8 @@ def test_settings_that_make_no_sense_are_an_error_of_one_line(arguments, words, 
     assert error.count("\n") == 1
 
 
-def test_a_first_ranking_is_printed_before_the_answer(swing, capsys):
-    assert diagnose(swing / "demo.h5", "--model", str(swing / "scene.xml")) == 0
-    said = capsys.readouterr().err
+def test_a_first_ranking_is_printed_before_the_answer(told):
+    _, said = told
     assert "diagnosing: first ranking, error expected to fall by: joint_damping " in said
 
 

@@ -14,6 +14,8 @@ from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.recording import Recording
 from tests.scenes.foreign import BALL, PUSHER, pusher, swing_up, thrown_ball, write_csv
 
+RIVALS_OF_DELAY = ("joint_damping", "actuator_delay", "joint_friction", "actuator_gain", "latency")
+"""Effects that an arm on position drives could lack."""
 RIVALS_OF_DRAG = ("air_drag", "wind", "gravity_tilt", "time_base", "length_scale", "latency", "contact_compliance")
 """Effects that a thrown ball could lack."""
 
@@ -52,10 +54,14 @@ def parameters(added: Any, model: cw.Model) -> Any:
     return added.effect.parameters(model.scene.model)
 
 
-def test_damping_and_delay_of_an_arm_are_found_where_noise_is_not_stated(tmp_path):
-    recording = read(pusher, tmp_path)
+@pytest.mark.parametrize(
+    ("effects", "seconds"),  # all of them are candidates where nothing is missing, below
+    [pytest.param((), 6.0, marks=pytest.mark.slow, id="all"), pytest.param(RIVALS_OF_DELAY, 3.0, id="rivals")],
+)
+def test_damping_and_delay_of_an_arm_are_found_where_noise_is_not_stated(tmp_path, effects, seconds):
+    recording = read_csv(write_csv(pusher(seconds=seconds), tmp_path / "arm"))
     assert all(c.noise_std is None for d in recording.demonstrations for c in d.measured.values())
-    found = diagnosed(recording)
+    found = diagnosed(recording, effects=effects)
     assert found.verdict in ("effect", "group")
     assert {f.name for f in found.accepted} == {"joint_damping", "actuator_delay"}
     assert all(len(group) <= 2 for group in found.groups)
@@ -82,7 +88,7 @@ def test_nothing_is_missing_from_an_arm_but_a_shorter_time_step(tmp_path):
 
 
 def test_damping_that_is_off_by_no_more_than_friction_varies_is_not_missing(tmp_path):
-    recording = read_csv(write_csv(pusher(damping=0.15, delay=0.0, noise=2e-4), tmp_path / "arm"))
+    recording = read_csv(write_csv(pusher(damping=0.15, delay=0.0, noise=2e-4, seconds=4.0), tmp_path / "arm"))
     recording = replace(recording, scene=PUSHER.replace('damping="0.05"', 'damping="0.14"'))
     found = diagnosed(recording, effects=("joint_damping", "joint_friction", "actuator_gain", "actuator_delay"))
     assert found.verdict == "none_needed"
@@ -91,7 +97,7 @@ def test_damping_that_is_off_by_no_more_than_friction_varies_is_not_missing(tmp_
 
 
 def test_one_encoder_that_is_late_is_named(tmp_path):
-    recording = read_csv(write_csv(pusher(damping=0.05, delay=0.0, late=0.02), tmp_path / "arm"))
+    recording = read_csv(write_csv(pusher(damping=0.05, delay=0.0, late=0.02, seconds=3.0), tmp_path / "arm"))
     found = diagnosed(recording, effects=("latency", "actuator_delay", "joint_damping", "sensor_gain"))
     assert found.verdict == "effect"
     assert [(f.name, f.target) for f in found.accepted] == [("latency(elbow_position)", ("elbow_position",))]
@@ -99,7 +105,7 @@ def test_one_encoder_that_is_late_is_named(tmp_path):
 
 
 def test_nothing_is_missing_from_a_swung_up_pendulum_but_a_shorter_time_step(tmp_path):
-    found = diagnosed(read_csv(write_csv(swing_up(coulomb=0.0, viscous=0.0), tmp_path / "pendulum")))
+    found = diagnosed(read_csv(write_csv(swing_up(coulomb=0.0, viscous=0.0, seconds=5.0), tmp_path / "pendulum")))
     assert found.verdict == "none_needed"
     assert not found.accepted
 

@@ -91,8 +91,8 @@ def dropped(restitution: float, seed: int) -> Demonstration:
 
 
 @cache
-def throws(drag: float, error: float) -> Recording:
-    return Recording(SCENE, tuple(thrown(drag, error, seed) for seed in range(5)))
+def throws(drag: float, error: float, count: int = 5) -> Recording:
+    return Recording(SCENE, tuple(thrown(drag, error, seed) for seed in range(count)))
 
 
 def diagnosed(recording: Recording, effects: tuple[str, ...], search: SearchCfg | None = None) -> Diagnosis:
@@ -112,7 +112,7 @@ def test_drag_is_found_beside_rebounds_that_no_law_foretells():
 
 
 def test_rebounds_that_are_as_the_model_has_them_need_no_allowance():
-    found = diagnosed(throws(DRAG, 0.0), CANDIDATES)
+    found = diagnosed(throws(DRAG, 0.0, 3), CANDIDATES)
     assert found.verdict == "effect"
     assert [f.name for f in found.accepted] == ["air_drag"]
     assert not any("impacts" in sentence for sentence in found.issues)
@@ -122,7 +122,7 @@ def test_rebounds_of_a_rigid_contact_are_no_effect_of_anything_else():
     # The simulated contact of the model lasts 8 ms: with it a ball seems to rebound from a floor that lies higher.
     scene = SCENE.replace('<framequat name="orientation" objtype="body" objname="ball"/>', "")
     scene = scene.replace("-40000 -20", "-160000 -56").replace('friction="0.3"', 'condim="1"')
-    recording = Recording(scene, tuple(dropped(0.8, seed) for seed in range(4)))
+    recording = Recording(scene, tuple(dropped(0.8, seed) for seed in range(3)))
     found = diagnosed(recording, ("frame_offset", "size", "wind"))
     assert (found.verdict, [f.name for f in found.accepted]) == ("none_needed", [])
     assert any("impacts" in sentence for sentence in found.issues)

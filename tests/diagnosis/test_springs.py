@@ -54,7 +54,7 @@ def recorded(scene: str, actuator: str, command: np.ndarray, torque: Any, inerti
 
 def door(stiffness: float, preload: float, damping: float = 0.6) -> Recording:
     """Return a door that is pushed and pulled by hand."""
-    time = np.arange(0, 6, PERIOD)
+    time = np.arange(0, 4, PERIOD)
     pushes = 9 * np.sin(np.pi * time) ** 2 * np.sign(np.sin(0.5 * np.pi * time)) - preload
     return recorded(DOOR, "hand", pushes, lambda q, v, u: u - damping * v - stiffness * q + preload, DOOR_INERTIA, 1)
 
@@ -65,7 +65,7 @@ def arm(
     kp: float = 1.0,
     kv: float = 1.0,
     reach: float = 0.8,
-    seconds: float = 3.0,
+    seconds: float = 2.4,
 ) -> Recording:
     """Return an arm that swings; a share of its weight is held up, and the servo's gains are off by factors."""
     time = np.arange(0, seconds, PERIOD)

@@ -101,7 +101,7 @@ def test_the_answer_comes_at_any_time_and_says_what_is_open(recording, monkeypat
     assert whole.unsettled == ()
     assert whole.verdict == "effect"
     verdicts, sentences = [], []
-    for looks in (1, 20, 30, 40, 50, 60, 70, 80, 100, 120, 150, 200, 300, 400, 600, 5000):
+    for looks in (1, 20, 40, 60, 80, 100, 150, 200, 300, 400, 5000):
         found = ended_after(looks, recording, monkeypatch)
         verdicts.append(found.verdict)
         sentences.append(found.unsettled)
@@ -201,12 +201,8 @@ def test_shares_of_the_time_leave_some_for_the_end():
 
 
 @pytest.mark.parametrize(("quiet", "verdict"), [(True, "unsettled"), (False, "effect")])
-@pytest.mark.parametrize(
-    ("module", "work"),
-    [(context, "nominal_sensitivities"), (additions, "finer_time_step"), (find_addition, "refit_from_rivals")],
-)
 def test_an_effect_beside_little_more_than_noise_is_not_settled_without_what_else_might_explain_that(
-    monkeypatch, quiet, verdict, module, work
+    monkeypatch, quiet, verdict
 ):
     recording = swung(damping=4e-4)
     cfg = replace(CFG, search=replace(CFG.search, doubtful_gain=1.1))
@@ -218,8 +214,11 @@ def test_an_effect_beside_little_more_than_noise_is_not_settled_without_what_els
     def no_time(*_args):
         raise TimeUpError
 
-    monkeypatch.setattr(module, work, no_time)
-    found = diagnose(drawing(recording), recording, cfg)
-    assert found.verdict == verdict
-    assert [f.name for f in found.accepted] == ["joint_damping"]
-    assert found.unsettled
+    works = [(context, "nominal_sensitivities"), (additions, "finer_time_step"), (find_addition, "refit_from_rivals")]
+    for module, work in works:
+        with monkeypatch.context() as patch:
+            patch.setattr(module, work, no_time)
+            found = diagnose(drawing(recording), recording, cfg)
+        assert found.verdict == verdict, work
+        assert [f.name for f in found.accepted] == ["joint_damping"], work
+        assert found.unsettled, work

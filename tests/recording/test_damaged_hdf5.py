@@ -43,7 +43,7 @@ def test_each_flipped_bit_in_scene_and_initial_state_is_noticed(path, entry):
 def test_a_flipped_bit_anywhere_is_noticed_or_without_effect(path, recording):
     sound, rng = path.read_bytes(), random.Random(1)
     harmless = 0
-    for _ in range(400):
+    for _ in range(160):
         damaged = bytearray(sound)
         place = rng.randrange(len(damaged))
         damaged[place] ^= 1 << rng.randrange(8)
@@ -54,7 +54,7 @@ def test_a_flipped_bit_anywhere_is_noticed_or_without_effect(path, recording):
             continue
         harmless += 1
         assert_same(read, recording)
-    assert harmless < 200
+    assert harmless < 80
 
 
 def test_a_file_without_checksums_is_read(path, recording):

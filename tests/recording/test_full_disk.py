@@ -1,13 +1,13 @@
 """Writing HDF5 to a disk that is full, for which a limit on the size of files stands in."""
 
 import os
-import subprocess
-import sys
 import textwrap
+from collections.abc import Iterator
 
 import pytest
 
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
+from tests.forks import Forks
 
 SCRIPT = """
     import resource, signal, sys
@@ -26,9 +26,15 @@ SCRIPT = """
 """
 
 
+@pytest.fixture(scope="module")
+def forks() -> Iterator[Forks]:
+    with Forks("concent_warp.recording.formats.hdf5") as found:
+        yield found
+
+
 @pytest.mark.parametrize("size", [0, 1, 500, 2_000, 8_000, 20_000])
 @pytest.mark.parametrize("old", [True, False])
-def test_a_full_disk_is_reported_in_one_sentence_and_leaves_the_old_file(tmp_path, recording, size, old):
+def test_a_full_disk_is_reported_in_one_sentence_and_leaves_the_old_file(tmp_path, recording, forks, size, old):
     source, out = tmp_path / "source.h5", tmp_path / "out" / "recording.h5"
     out.parent.mkdir()
     write_hdf5(recording, source)
@@ -36,8 +42,7 @@ def test_a_full_disk_is_reported_in_one_sentence_and_leaves_the_old_file(tmp_pat
     if old:
         write_hdf5(recording, out)
     before = out.read_bytes() if old else None
-    command = [sys.executable, "-c", textwrap.dedent(SCRIPT), str(source), str(out), str(size)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = forks.run(textwrap.dedent(SCRIPT), str(source), str(out), str(size))
     assert (done.returncode, done.stderr) == (2, "")
     assert done.stdout.startswith(f"{out}: the file cannot be written; found File too large; make room")
     assert len(done.stdout.splitlines()) == 1

@@ -1,6 +1,5 @@
 import json
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
 from concent_warp.render.dataset.statistics import ImageHistogram, merged_statistics, statistics_of_values
 from concent_warp.render.dataset.video import VideoWriter
+from tests.forks import Forks
 
 
 def episodes(folder: Path) -> list[dict]:
@@ -87,10 +87,15 @@ def test_lerobot_reads_every_frame(tmp_path):
     assert tuple(data[5]["observation.images.base"].shape) == (3, *LAYOUT.size)
 
 
+@pytest.fixture(scope="module")
+def forks() -> Iterator[Forks]:
+    with Forks("concent_warp.render.dataset.lerobot") as found:
+        yield found
+
+
 @pytest.mark.parametrize("last", [1, 3, 4, 5, 6, 8, 11])
-def test_killed_and_gone_on_with_loses_no_episode(tmp_path, last):
-    script = Path(__file__).with_name("small_dataset.py")
-    done = subprocess.run([sys.executable, str(script), str(tmp_path), str(last)], check=False, timeout=60)
+def test_killed_and_gone_on_with_loses_no_episode(tmp_path, forks, last):
+    done = forks.run(Path(__file__).with_name("small_dataset.py").read_text(), str(tmp_path), str(last))
     assert done.returncode == 9
     staged = [int(path.name) for path in (tmp_path / ".staging").iterdir() if path.name.isdigit()]
     saved = set(staged) | {row["source_index"] for row in episodes(tmp_path)}

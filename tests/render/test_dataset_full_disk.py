@@ -1,8 +1,7 @@
 """Data sets written to a disk that is full, for which a limit on the size of files stands in."""
 
-import subprocess
-import sys
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ from small_dataset import LAYOUT, write
 
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
+from tests.forks import Forks
 
 SCRIPT = """
     import resource, signal, sys
@@ -31,6 +31,13 @@ SCRIPT = """
 """
 
 
+@pytest.fixture(scope="module")
+def forks() -> Iterator[Forks]:
+    names = ("lerobot", "robomimic", "video")
+    with Forks(*(f"concent_warp.render.dataset.{name}" for name in names)) as found:
+        yield found
+
+
 def files(folder: Path) -> dict[str, bytes]:
     """Return the content of the files of a data set that are not staged."""
     found = [path for path in folder.rglob("*") if path.is_file() and ".staging" not in path.parts]
@@ -39,15 +46,14 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("size", [0, 500, 2_000, 6_000])
 @pytest.mark.parametrize("kind", ["robomimic", "lerobot"])
-def test_a_full_disk_ends_in_an_error_and_the_data_set_can_be_continued(tmp_path, kind, size):
+def test_a_full_disk_ends_in_an_error_and_the_data_set_can_be_continued(tmp_path, forks, kind, size):
     Writer = {"lerobot": LeRobotWriter, "robomimic": RobomimicWriter}[kind]
     writer = Writer(tmp_path, LAYOUT)
     write(writer, range(2))
     assert writer.finish() == 2
     before = files(tmp_path)
     place = str(Path(__file__).parent)
-    command = [sys.executable, "-c", textwrap.dedent(SCRIPT), str(tmp_path), kind, str(size), place]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = forks.run(textwrap.dedent(SCRIPT), str(tmp_path), kind, str(size), place)
     assert done.returncode == 2, done.stderr
     assert {name: files(tmp_path)[name] for name in before} == before
     assert not [path for path in tmp_path.rglob("*partial*") if ".staging" not in path.parts]
@@ -95,8 +101,7 @@ VIDEO = """
 
 @pytest.mark.parametrize("size", [0, 1_000, 100_000])
 @pytest.mark.parametrize("what", ["film", "join"])
-def test_a_video_on_a_full_disk_is_an_error_and_no_crash(tmp_path, what, size):
-    command = [sys.executable, "-c", textwrap.dedent(VIDEO), str(tmp_path), what, str(size)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+def test_a_video_on_a_full_disk_is_an_error_and_no_crash(tmp_path, forks, what, size):
+    done = forks.run(textwrap.dedent(VIDEO), str(tmp_path), what, str(size))
     assert (done.returncode, done.stderr) == (2, "")
     assert done.stdout == f"[Errno 27] File too large: '{tmp_path}/film.mp4'\n"

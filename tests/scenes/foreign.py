@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -97,6 +98,7 @@ def _integrated(
     return np.concatenate(found, axis=1).T
 
 
+@cache
 def pusher(
     damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, seconds: float = 6.0, late: float = 0.0
 ) -> Recording:
@@ -142,10 +144,10 @@ def pusher(
         return np.concatenate([v, np.linalg.solve(mass, torque - coriolis)])
 
     time = np.arange(late, seconds - 0.02, 0.008)
-    shoulder, elbow = (
-        _integrated(rates, [0.0] * 4, time - age, period, delay)[:, j] for j, age in ((0, 0.0), (1, late))
-    )
-    angles = np.stack([shoulder, elbow], axis=1) + rng.normal(0, noise, (len(time), 2))
+    angles = _integrated(rates, [0.0] * 4, time, period, delay)[:, :2]
+    if late:
+        angles[:, 1] = _integrated(rates, [0.0] * 4, time - late, period, delay)[:, 1]
+    angles += rng.normal(0, noise, angles.shape)
     demonstration = Demonstration(
         "demo_0",
         qpos=np.zeros(2),
@@ -159,6 +161,7 @@ def pusher(
     return Recording(PUSHER, (demonstration,))
 
 
+@cache
 def swing_up(coulomb: float = 0.03, viscous: float = 0.01, *, noise: float = 1.5e-3, seconds: float = 8.0) -> Recording:
     """Return the log of a pendulum that a motor swings up in growing swings; its model has no friction at all.
 
@@ -195,6 +198,7 @@ def swing_up(coulomb: float = 0.03, viscous: float = 0.01, *, noise: float = 1.5
     return Recording(PENDULUM, (demonstration,))
 
 
+@cache
 def thrown_ball(drag: float = 0.5, *, noise: float = 1e-3, heights_only: bool = False, throws: int = 3) -> Recording:
     """Return tracks of a light ball in the air, by position alone; its model has no drag.
 

@@ -21,7 +21,7 @@ SIZES = FlowPolicyCfg(
     small=SmallBackboneCfg(channels=(8, 16, 32), text_layers=1, fusion_layers=1, text_bytes=40),
 )  # fmt: skip
 TINY = TrainFlowCfg(
-    steps=300, batch=32, learning_rate=3e-3, warm_up=20, ema=0.98, validate=100, validation_samples=64, policy=SIZES,
+    steps=210, batch=32, learning_rate=5e-3, warm_up=20, ema=0.98, validate=70, validation_samples=64, policy=SIZES,
     blank_state=0.0, data=FlowDataCfg(validation=0.2),
     augment=AugmentCfg(
         shift=0, brightness=0.02, contrast=0.02, balance=0.02, gamma=(1, 1), vignette=0, noise=0, blur=0,

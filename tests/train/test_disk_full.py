@@ -1,8 +1,8 @@
 """A full disk is said in one sentence with the file; what was there stays whole, and nothing unfinished is left."""
 
-import json
-import subprocess
-import sys
+import resource
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,30 +12,32 @@ from concent_warp.cli import main
 
 assert trained
 """Fixture."""
-CHILD = """
-import json, resource, signal, sys
-from concent_warp.cli import main
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-before = resource.getrlimit(resource.RLIMIT_FSIZE)
-for limit, arguments in json.loads(sys.argv[1]):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    code = main(arguments)
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    sys.stderr.flush()
-    print(f"\\nENDED {code}", file=sys.stderr, flush=True)
-"""
 
 
-def run_limited(commands: list[tuple[int, list[str]]]) -> list[tuple[int, str]]:
-    """Run commands that cannot write larger files than a limit [bytes]; return exit codes and last lines of errors."""
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD, json.dumps(commands)], capture_output=True, text=True, timeout=250
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr, done.stderr
-    parts = done.stderr.split("\nENDED ")
-    codes = [int(part.split("\n")[0]) for part in parts[1:]]
-    return [(code, part.strip().splitlines()[-1]) for code, part in zip(codes, parts[:-1], strict=True)]
+@pytest.fixture
+def run_limited(capsys) -> Callable[[list[tuple[int, list[str]]]], list[tuple[int, str]]]:
+    """Return a function that runs commands that cannot write larger files than a limit [bytes].
+
+    It returns exit codes and last lines of errors.
+    """
+
+    def run(commands: list[tuple[int, list[str]]]) -> list[tuple[int, str]]:
+        before, handled, found = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ), []
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        for limit, arguments in commands:
+            capsys.readouterr()
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+            try:
+                code = main(arguments)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, before)
+            said = capsys.readouterr().err
+            assert "Traceback" not in said, said
+            found.append((code, said.strip().splitlines()[-1]))
+        signal.signal(signal.SIGXFSZ, handled)
+        return found
+
+    return run
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -43,7 +45,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_training_that_finds_the_disk_full_leaves_the_earlier_one(trained, tmp_path):
+def test_training_that_finds_the_disk_full_leaves_the_earlier_one(trained, tmp_path, run_limited):
     copied(trained, tmp_path)
     before = content(tmp_path)
     limits = [0, 1000, 3000, 12_000, 15_000, 30_000]
@@ -56,7 +58,7 @@ def test_training_that_finds_the_disk_full_leaves_the_earlier_one(trained, tmp_p
     assert content(tmp_path) == before
 
 
-def test_training_that_fills_the_disk_keeps_its_last_checkpoint(trained, tmp_path):
+def test_training_that_fills_the_disk_keeps_its_last_checkpoint(trained, tmp_path, run_limited):
     run = copied(trained, tmp_path)
     size = (run / "checkpoint.pt").stat().st_size
     curve = run / "curve.jsonl"
@@ -72,7 +74,7 @@ def test_training_that_fills_the_disk_keeps_its_last_checkpoint(trained, tmp_pat
     assert main(training(tmp_path, "--resume", "--iterations", "2")) == 0
 
 
-def test_export_to_a_full_disk_leaves_the_earlier_file(trained, tmp_path):
+def test_export_to_a_full_disk_leaves_the_earlier_file(trained, tmp_path, run_limited):
     run = copied(trained, tmp_path)
     commands = []
     for name in ("policy.onnx", "policy.pt", "pretrained"):

@@ -1,5 +1,6 @@
 """Edge spheres that a training adds to a contact geometry."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +60,23 @@ def test_geometry_with_edge_spheres_of_its_own_gets_hardly_more(model):
     more = len(extended(model)) - len(model.geometry)
     assert more > 300
     assert len(extended(own)) - len(own.geometry) < 0.2 * more
+
+
+def test_the_same_edge_spheres_are_computed_once_and_others_anew(model, monkeypatch):
+    touched = np.zeros(len(model.geometry), dtype=bool)
+    touched[model.geometry.of("block")[:30]] = True
+    first, again = (extended(copy.deepcopy(model), touched.copy()) for _ in range(2))
+    for name in ("body", "position", "radius", "mass", "friction"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    calls, of_body = [], Surface.of_body
+    monkeypatch.setattr(Surface, "of_body", lambda *given: calls.append(given) or of_body(*given))
+    extended(model, touched)
+    assert not calls
+    moved = model.geometry.with_position(model.geometry.position + np.array([1e-3, 0, 0]))
+    extended(replace(model, geometry=moved), touched)
+    assert calls
+    touched[model.geometry.of("box")[:30]] = True
+    assert len(extended(model, touched)) > len(first)
 
 
 def test_edges_move_as_the_faces_beside_them(model):

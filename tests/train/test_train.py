@@ -43,7 +43,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return torch.load(folder / CHECKPOINT, weights_only=True)["actor_state_dict"]
 
 
-@pytest.mark.parametrize(("position", "iterations"), [(0.004, 18), pytest.param(0.008, 28, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("position", "iterations"), [(0.004, 14), pytest.param(0.008, 28, marks=pytest.mark.slow)])
 def test_insertion_is_learnt_from_contact_events_on_a_cpu(made, position, iterations):
     """Initial states half as far from the demonstration are learnt in fewer iterations."""
     reset = replace(SETTINGS.reset, position=position)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from concent_warp.errors import SceneError
 from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from concent_warp.scene.spheres.edges import edge_spheres
@@ -32,37 +34,13 @@ def with_edge_spheres(model: Model, touched: np.ndarray, cfg: EdgeCfg) -> Model:
         touched: Whether a sphere takes part in contact events, shape (S,) bool.
         cfg: Number, size and reach of the spheres.
     """
+    assert model.geometry is not None
     geometry = model.geometry
-    assert geometry is not None
-    surfaces: dict[int, Surface] = {}
-    for body, name in enumerate(geometry.bodies):
-        try:
-            surfaces[body] = Surface.of_body(model.scene, name)
-        except SceneError:
-            continue
-    area = sum(surface.area for surface in surfaces.values())
-    parts = []
-    for body, surface in surfaces.items():
-        own = np.flatnonzero(geometry.body == body)
-        near = geometry.position[own[touched[own]]]
-        if not len(near):
-            continue
-        points, _ = surface.sample(CANDIDATES, np.random.default_rng(body))
-        count = round(cfg.count * surface.area / area)
-        larger = inset(surface, points, float(np.median(geometry.radius[own])))
-        centres, radius = edge_spheres(surface, points, larger, count, cfg.radius, min_radius=0.1 * cfg.radius)
-        beside = np.linalg.norm(centres[:, None] - near, axis=2).min(axis=1, initial=np.inf) < cfg.reach
-        own_small = own[geometry.radius[own] <= 2 * cfg.radius]
-        apart = np.linalg.norm(centres[:, None] - geometry.position[own_small], axis=2).min(axis=1, initial=np.inf)
-        new = beside & (apart > cfg.gap)
-        centres, radius = centres[new], radius[new]
-        closest = np.linalg.norm(centres[:, None] - geometry.position[own], axis=2)
-        friction = geometry.friction[own[closest.argmin(axis=1)]] if len(centres) else np.empty(0)
-        moved = centres + displacement(surface, geometry.position[own], geometry.radius[own], closest)
-        parts.append((np.full(len(centres), body), moved, radius, friction))
-    if not parts:
+    key = tuple(_Content(value) for value in (geometry.body, geometry.position, geometry.radius, geometry.friction))
+    added = _edge_spheres(model.scene, geometry.bodies, key, _Content(touched), cfg)
+    if added is None:
         return model
-    body, position, radius, friction = (np.concatenate(values) for values in zip(*parts, strict=True))
+    body, position, radius, friction = added
     extended = ContactGeometry(
         geometry.bodies,
         np.append(geometry.body, body),
@@ -72,6 +50,60 @@ def with_edge_spheres(model: Model, touched: np.ndarray, cfg: EdgeCfg) -> Model:
         np.append(geometry.friction, friction),
     )
     return replace(model, geometry=extended)
+
+
+class _Content:
+    """An array that is equal to another one of the same content, so that results can be remembered by it."""
+
+    def __init__(self, value: np.ndarray) -> None:
+        self.value = value.copy()
+        self._key = (value.shape, value.dtype.str, value.tobytes())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content) and self._key == other._key
+
+
+@lru_cache(maxsize=4)
+def _edge_spheres(
+    scene: Scene, bodies: tuple[str, ...], fitted: tuple[_Content, ...], touched: _Content, cfg: EdgeCfg
+) -> tuple[np.ndarray, ...] | None:
+    """Return indices of bodies, centres, radii and frictions of the edge spheres; None where there are none.
+
+    The last results are kept: each evaluation, rendering and training of one policy wants the same.
+    """
+    of_body, centre, size, rubbing = (one.value for one in fitted)
+    surfaces: dict[int, Surface] = {}
+    for body, name in enumerate(bodies):
+        try:
+            surfaces[body] = Surface.of_body(scene, name)
+        except SceneError:
+            continue
+    area = sum(surface.area for surface in surfaces.values())
+    parts = []
+    for body, surface in surfaces.items():
+        own = np.flatnonzero(of_body == body)
+        near = centre[own[touched.value[own]]]
+        if not len(near):
+            continue
+        points, _ = surface.sample(CANDIDATES, np.random.default_rng(body))
+        count = round(cfg.count * surface.area / area)
+        larger = inset(surface, points, float(np.median(size[own])))
+        centres, radius = edge_spheres(surface, points, larger, count, cfg.radius, min_radius=0.1 * cfg.radius)
+        beside = np.linalg.norm(centres[:, None] - near, axis=2).min(axis=1, initial=np.inf) < cfg.reach
+        own_small = own[size[own] <= 2 * cfg.radius]
+        apart = np.linalg.norm(centres[:, None] - centre[own_small], axis=2).min(axis=1, initial=np.inf)
+        new = beside & (apart > cfg.gap)
+        centres, radius = centres[new], radius[new]
+        closest = np.linalg.norm(centres[:, None] - centre[own], axis=2)
+        friction = rubbing[own[closest.argmin(axis=1)]] if len(centres) else np.empty(0)
+        moved = centres + displacement(surface, centre[own], size[own], closest)
+        parts.append((np.full(len(centres), body), moved, radius, friction))
+    if not parts:
+        return None
+    return tuple(np.concatenate(values) for values in zip(*parts, strict=True))
 
 
 def displacement(surface: Surface, centres: np.ndarray, radius: np.ndarray, distance: np.ndarray) -> np.ndarray:

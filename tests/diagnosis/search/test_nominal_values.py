@@ -105,7 +105,7 @@ def test_candidates_share_the_sensitivities_to_nominal_values_of_the_model_that_
 
 
 def test_the_tolerance_of_a_drive_widens_the_interval_of_a_damping_unless_nominal_values_are_exact():
-    recording, without = pusher(damping=0.15, delay=0.0, seconds=4.0), cw.Model(cw.Scene(PUSHER))
+    recording, without = pusher(damping=0.15, delay=0.0, seconds=3.0), cw.Model(cw.Scene(PUSHER))
     halves = []
     for enabled in (True, False):
         cfg = cw.DiagnoseCfg(
@@ -252,7 +252,7 @@ def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():
 def test_nominal_values_stay_as_given_where_that_is_asked_for():
     wrong = cw.Model(cw.Scene(PUSHER.replace('kp="12"', 'kp="11.8"')))
     cfg = cw.DiagnoseCfg(jobs=1, explain=False, effects=("actuator_gain",), nominal=NominalCfg(enabled=False))
-    found = cw.diagnose(wrong, pusher(damping=0.05, delay=0.0, seconds=4.0), cfg)
+    found = cw.diagnose(wrong, pusher(damping=0.05, delay=0.0, seconds=3.0), cfg)
     assert not found.nominal_values
     # The velocity gain is right.
     assert found.groups == (("actuator_gain(shoulder, ..., kp)",),)

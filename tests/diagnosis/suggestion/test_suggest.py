@@ -142,7 +142,7 @@ def test_a_search_ends_where_it_finds_nothing_better(monkeypatch):
     monkeypatch.setattr(Search, "_evolved", lambda self, family, *_: evolved(self, family, counts.append))
     for gain, most in ((1e-6, 5), (1e3, 3)):
         counts.clear()
-        cfg = replace(QUICK, method="optimised", evaluations=40, patience=2, min_gain=gain, enough=1e6)
+        cfg = replace(QUICK, method="optimised", evaluations=20, population=4, patience=2, min_gain=gain, enough=1e6)
         suggest(MODEL, RECORDING, cfg, diagnosis=open_group())
         assert len(counts) <= most
     assert len(counts) == 3
