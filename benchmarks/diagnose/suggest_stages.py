@@ -198,6 +198,7 @@ def row_of(one: SuggestSet, folder: Path) -> dict[str, Any] | None:
         "rig": one.base.rig,
         "truth": sorted(one.base.magnitudes),
         "seed": one.base.seed,
+        "repeat": one.repeat,
         "machine": begun["machine"],
         "seconds": 0.0,
     }

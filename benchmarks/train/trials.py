@@ -92,16 +92,24 @@ another on one GPU beside 15 diagnoses (263, 482 and 489 s of learning), and are
 
 Without a fit of the contact geometry (`--cases inset --edges 400`, default settings; trials with `--case inset`) seeds
 40 to 44 were trained on 2026-11-29. The policies of 43 and 44 (100 and 99.8 % in simulation) were left behind on the
-machine, and a second training of 43 was cut off: they were not tried. The settings were chosen with fitted geometry.
-From other initial states the policies of 40 to 42 succeed in 198, 200 and 198 of 200 trials (`concent evaluate
---checkpoint POLICY --world reality --episodes 200`).
+machine, and a second training of 43 was cut off. A third one of 43, on 2026-11-30, is in the table; a second one of 44
+was cut off, too, and was not tried. The settings were chosen with fitted geometry. From other initial states the
+policies of 40 to 42 succeed in 198, 200 and 198 of 200 trials (`concent evaluate --checkpoint POLICY --world reality
+--episodes 200`).
 
 With the engineered reward in place of the contact events (`--cases engineered --edges 400`, default settings; trials
 with `--case engineered`) seeds 40 to 49 were trained on 2026-11-29, each on one H200, 40 to 44 beside 14 diagnoses and
 45 to 49 beside 28 and another training on a second GPU, in the contact geometries that ours have; learning took 137 to
-154 s. The settings were chosen with the reward of contact events. Five trainings from the paper's starting
-geometry (`--cases surface`, seeds 40 to 44) were begun the same day and ended at once with an error of the benchmark,
-which is mended since: of such a model the insertion is no stage of its own. They were not repeated.
+154 s. The settings were chosen with the reward of contact events.
+
+From the paper's starting geometry, spheres centred on the surface, with the reward of contact events (`--cases surface
+--edges 400`) and with the engineered one (`--cases unconstrained --edges 400`), seeds 40 to 42 were trained on
+2026-11-30 with default settings, one after another on one H200 beside 15 diagnoses; learning took 120 to 145 s. Spheres
+that stand out of the surface by their radius fill the hole: in such a model the demonstration does not get into it,
+so that insertion is no stage, and policies learn the last stage that there is, *align*. Their success in simulation and
+in the stress test is that of this stage; with the engineered reward there is none in simulation either. In the trial
+they are judged by insertion, as all others. Five trainings of `surface` that were begun the day before, seeds 40 to 44,
+ended at once with an error of the benchmark, which is mended since.
 
 Until 2026-11-27 trainings had no finish (`--finish.share 0`). Its physics, all spheres or the shapes of the scene, was
 chosen with the geometry of seeds 34 and 37, after a look at the states in which policies without it get stuck ([what
@@ -223,12 +231,16 @@ def beside_ours(rows: Sequence[Row]) -> list[str]:
 
 
 def prediction(rows: Sequence[Row]) -> str:
-    """Return what the rank correlation of stress test and trial is, of all policies and of those that chose nothing."""
+    """Return what the rank correlation of stress test and trial is, of all policies and of those that chose nothing.
+
+    Policies that learned an earlier stage are left out: their stress test is of that stage.
+    """
+    rows = [row for row in rows if row["trained"]["stage"] == row.get("stage", "insert")]
     fresh = [row for row in rows if row["seed"] >= FRESH]
     said = f"Spearman's rank correlation over {len(rows)} policies, settings and seeds mixed: {correlation(rows)}"
     if len(fresh) > 2:
         said += f"; over {len(fresh)} of seeds from {FRESH} on, which the test was not made with: {correlation(fresh)}"
-    return f"{said} (bootstrap over policies)."
+    return f"{said} (bootstrap over policies; without those that learned an earlier stage, whose stress test is of it)."
 
 
 def correlation(rows: Sequence[Row]) -> str:

@@ -71,6 +71,7 @@ def test_the_page_counts_what_was_measured(tmp_path, monkeypatch):
             "name": name,
             "group": GROUP,
             "true": "joint_friction",
+            "repeat": 3 if name == "c" else 0,
             "methods": {m: {"outcome": found, "seconds": 9.0} for m in METHODS},
         }
         for name, found in outcomes.items()
@@ -81,6 +82,8 @@ def test_the_page_counts_what_was_measured(tmp_path, monkeypatch):
     text = page(rows, 84)
     assert "| suggested (best of menu and search) | 5 | 2 (40 %) | 1 (20 %) | 0 (0 %) | 1 (20 %) | 1 | 0 |" in text
     assert "| suggested (best of menu and search) | 4 | 2 (50 %) | 1 (25 %) | 0 (0 %) | 0 (0 %) | 1 | 0 |" in text
+    assert "| the first 3 | suggested (best of menu and search) | 4 | 2 (50 %) | 0 (0 %) |" in text
+    assert "| others | suggested (best of menu and search) | 1 | 0 (0 %) | 1 (100 %) |" in text
     words = " ".join(text.split())
     assert "Of 84 data sets 9 were begun" in words
     assert "1 of these were stopped in the first diagnosis" in words

@@ -12,7 +12,8 @@ def row(seed, successes, **given):
     facts = dict.fromkeys(("processor", "cores", "python", "mujoco", "mujoco-warp", "warp-lang", "torch", "date"), "x")
     return {
         "case": "ours", "seed": seed, "episodes": 100, "successes": successes, "settings": "", "spheres": 512,
-        "machine": facts, "trained_on": facts, "trained": {"steps": 9_830_400}, "simulation": {"rate": 1.0},
+        "machine": facts, "trained_on": facts, "simulation": {"rate": 1.0},
+        "trained": {"steps": 9_830_400, "stage": given.get("stage", "insert")},
         "stress": {"successes": successes // 2, "episodes": 50}, **given,
     }  # fmt: skip
 
@@ -44,6 +45,15 @@ def test_prediction_is_of_insertion_alone(trials):
     away = row(9, 0, task="stacking", stage="insert") | {"stress": {"successes": 50, "episodes": 50}}
     assert "over 4 policies" in trials.page([*rows, away])
     assert "correlation over 4 policies, settings and seeds mixed: 1.00" in trials.page([*rows, away])
+
+
+def test_prediction_is_of_policies_that_learned_what_they_are_tried_on(trials):
+    rows = [row(seed, 50 + 10 * seed) for seed in range(4)]
+    earlier = row(9, 0, case="surface") | {"stress": {"successes": 50, "episodes": 50}}
+    earlier["trained"] = earlier["trained"] | {"stage": "align"}
+    text = trials.page([*rows, earlier])
+    assert "correlation over 4 policies, settings and seeds mixed: 1.00" in text
+    assert "| default, without contact geometry optimisation | 512 |" in text
 
 
 def test_a_folder_without_trainings_is_refused_and_no_page_is_written(trials, monkeypatch, tmp_path):
