@@ -17,7 +17,11 @@ function items() {
   while (frame + 1 < one.at.length && one.at[frame + 1] <= state.time + 1e-6) frame++;
   data.bodies.forEach((body, b) => {
     const k = 7 * (frame * data.bodies.length + b), row = Array.from(one.poses.subarray(k, k + 7));
-    if (Number.isFinite(row[0])) for (const geom of body.geoms) found.push(...geomItems(geom, row.slice(0, 3), row.slice(3), geom.colour));
+    if (!Number.isFinite(row[0])) return;
+    // A weight within what carries it is seen through it.
+    const weights = one.weights[body.name] ?? [], seen = weights.length ? 0.35 : 1;
+    for (const geom of weights) found.push(...geomItems(geom, row.slice(0, 3), row.slice(3), geom.colour));
+    for (const geom of body.geoms) found.push(...geomItems(geom, row.slice(0, 3), row.slice(3), [...geom.colour.slice(0, 3), Math.min(geom.colour[3], seen)]));
   });
   return found;
 }

@@ -23,6 +23,10 @@ from concent_warp.version import __version__
 
 MOST_SAMPLES = 1500
 """Samples of a line in a chart; longer series are thinned."""
+DENSITY = 7870.0
+"""Density of the iron ball as which a weight is drawn [kg/m^3]."""
+COLOUR = (0.85, 0.55, 0.1, 1.0)
+"""Colour of weights."""
 
 
 def write_motion_page(path: str | Path, suggestion: Suggestion) -> None:
@@ -51,6 +55,7 @@ def write_motion_page(path: str | Path, suggestion: Suggestion) -> None:
                 "duration": d.duration,
                 "motion": motion_data({"motion": model}, engines, d, names),
                 "commands": _lines(motion),
+                "weights": _weights(motion),
             }
             for k, (d, motion) in enumerate(zip(chosen, suggestion.motions, strict=True))
         ],
@@ -83,6 +88,16 @@ def _lines(motion: SuggestedMotion) -> list[dict[str, Any]]:
         rows = _thinned(len(time))
         value = np.append(series.value.ravel(), series.value.ravel()[-1:])
         found.append({"name": name, "unit": series.unit, "time": packed(time[rows]), "value": packed(value[rows])})
+    return found
+
+
+def _weights(motion: SuggestedMotion) -> dict[str, list[dict[str, Any]]]:
+    """Return the weights of a motion by the name of the body that carries them, each as a ball of iron."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for payload in motion.payloads:
+        radius = (3 * payload.mass / (4 * np.pi * DENSITY)) ** (1 / 3)
+        ball = {"shape": "sphere", "size": [round(float(radius), 5)] * 3, "position": list(payload.position)}
+        found.setdefault(payload.body, []).append({**ball, "quaternion": [1, 0, 0, 0], "colour": list(COLOUR)})
     return found
 
 

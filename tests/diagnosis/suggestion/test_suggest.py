@@ -1,4 +1,6 @@
 import csv
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from concent_warp.diagnosis.suggestion.suggest import EVALUATIONS_FILE, suggest
 from concent_warp.errors import ConcentError
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
+from concent_warp.report.suggestion.page import write_motion_page
 from concent_warp.scene.scene import Scene
 from tests.diagnosis.suggestion.carts import one_speed, open_group
 
@@ -126,6 +129,12 @@ def test_a_weight_is_asked_for_where_no_motion_is_clear(found, tmp_path):
     (kept,) = load_recording(written[0])[0].payloads
     assert (kept.body, kept.mass) == (weight["body"], weight["mass"])
     assert min(p.separation for p in heavy.pairs) >= min(p.separation for p in found.pairs)
+    write_motion_page(tmp_path / "motion.html", heavy)
+    data = re.search(r'<script[^>]*id="data">(.*?)</script>', (tmp_path / "motion.html").read_text(), re.DOTALL)
+    assert data is not None
+    ((ball,),) = (one["weights"]["cart"] for one in json.loads(data[1])["motions"])
+    assert 4 / 3 * np.pi * ball["size"][0] ** 3 * 7870 == pytest.approx(weight["mass"], rel=1e-2)
+    assert ball["position"] == pytest.approx(weight["position"])
 
 
 def test_nothing_is_searched_where_the_menu_separates_by_far(menu, monkeypatch):
