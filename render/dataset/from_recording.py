@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,7 +21,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.checks import Bounds, check_settings
-from concent_warp.errors import RenderError
+from concent_warp.errors import RenderError, printable
 from concent_warp.files import write_text
 from concent_warp.recording.logs.readers.calibration import FILE, Calibration, write_calibration
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, Recording
@@ -72,7 +73,8 @@ def write_lerobot(
     """Write a recording as a LeRobot v3 data set, with calibration, scene and map beside it.
 
     Commands are held until the next one; measurements are interpolated linearly; images are the nearest in time. Poses
-    of bodies are features of their own, NaN where a body is lost. Covariances and point tracks have no place there.
+    of bodies are features of their own, NaN where a body is lost. Covariances and point tracks have no place there, nor
+    have payloads, of which a warning is given.
 
     Args:
         recording: The recording; its demonstrations have the same channels and cameras.
@@ -100,6 +102,14 @@ def write_lerobot(
     scene = Scene(recording.scene, recording.source)
     first = recording[0]
     _check_alike(recording)
+    if loaded := [d.name for d in recording.demonstrations if d.payloads]:
+        warnings.warn(
+            printable(
+                f"{out}: payloads have no place in a LeRobot data set: that bodies carry weights in "
+                f"{', '.join(loaded[:3])}{', ...' * (len(loaded) > 3)} is not written"
+            ),
+            stacklevel=2,
+        )
     rate = cfg.rate or _image_rate(first)
     sensors = _Sensors.of(scene.model, first)
     cameras = tuple(first.image)

@@ -134,6 +134,13 @@ def test_poses_without_video_are_resampled_at_a_rate(tmp_path):
     np.testing.assert_allclose(found.value[14], true[7], atol=1e-6)
 
 
+def test_weights_that_a_data_set_lacks_are_warned_of(tmp_path):
+    loaded = replace(recording()[0], image={}, payloads=(cw.Payload("arm", 0.2),))
+    with pytest.warns(UserWarning, match="payloads have no place in a LeRobot data set: that bodies carry weights in "):
+        cw.write_lerobot(replace(recording(), demonstrations=(loaded,)), tmp_path / "d")
+    assert not read_back(tmp_path / "d")[0].payloads
+
+
 def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
     whole = recording()
     second = replace(whole[0], name="demo_1", image={})
