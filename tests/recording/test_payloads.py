@@ -16,6 +16,7 @@ from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.payloads import Payload, scene_with_payloads
+from concent_warp.train.run import TrainingRun
 
 BOB = Payload("arm", 0.2, (0.0, 0.01, -0.1), (1e-4, 1e-4, 5e-5))
 
@@ -109,6 +110,12 @@ def test_payloads_of_a_folder_of_csv_files(servo, tmp_path):
     (tmp_path / "payloads.csv").write_text("body,mass,x,y,z\narm,0.2,0,0.01\n")
     with pytest.raises(RecordingError, match=r"line 2.*number of cells"):
         read_csv(tmp_path)
+
+
+def test_a_training_refuses_payloads(servo):
+    model = cw.Model.from_recording(servo)
+    with pytest.raises(RecordingError, match="a training"):
+        TrainingRun.new(model, carrying(servo, BOB), cw.TrainCfg())
 
 
 @pytest.mark.parametrize(
