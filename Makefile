@@ -8,7 +8,7 @@ LEROBOT ?= build/lerobot
 LEROBOT_PYTHON ?= python3.12
 BROWSERS := chromium chromium-browser google-chrome
 
-.PHONY: help demo setup test check lint types imports tests lerobot docs format hooks layout system clean
+.PHONY: help demo setup test check lint types imports tests slow lerobot docs format hooks layout system clean
 .DEFAULT_GOAL := help
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo "make types    check types"
 	@echo "make imports  check who imports whom"
 	@echo "make tests    run the tests, which also build the documentation site and run notebook and examples"
+	@echo "make slow     run the tests that take long, which the others leave out"
 	@echo "make lerobot  test the plug-ins for lerobot, in an environment of their own, in build/lerobot"
 	@echo "make docs     build the documentation site, in build/site"
 	@echo "make format   format the code"
@@ -57,6 +58,10 @@ imports: .venv/installed-dev layout
 # `tests/conftest.py`, the longest first.
 tests: .venv/installed-dev
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest \
+		-n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
+slow: .venv/installed-dev
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -m "slow and not gpu" --timeout=900 \
 		-n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # lerobot wants another Python and another torch than the rest.

@@ -19,12 +19,23 @@ LONG = (
     *("test_cli_diagnose.py", "test_disk_full.py", "test_rough_impacts.py"),
 )
 """Files of more than a quarter of a minute, the longest first."""
+SLOW = Path(__file__).with_name("slow.txt")
+"""Names of slow tests, besides those that are marked where they stand."""
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 """Where a number of processes is not given, work is done in the test's own: one worker a CPU runs tests already."""
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put long files first, so that no worker begins one when the others have nothing left to do."""
+    """Mark what `slow.txt` lists, before slow tests are left out.
+
+    Put long files first, so that no worker begins one when the others have nothing left to do.
+    """
+    slow = {line for line in SLOW.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+    for item in items:
+        name = item.nodeid
+        if not slow.isdisjoint({name, name.partition("[")[0], name.partition("::")[0]}):
+            item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
