@@ -38,6 +38,9 @@ def test_another_case_has_a_row_of_its_own_and_is_compared_on_the_seeds_that_bot
     assert "spheres inset: 81.0%, ours 85.0% with the same settings on the seeds that both have (1, 2)" in text
     assert "The difference is 4.0 points [-8.7, 16.7]" in text
     assert "both have" not in trials.page([*ours, row(1, 85, case="inset", settings="--seed 3")])
+    fewer = [row(seed, successes, case="surface") | {"spheres": 100} for seed, successes in ((1, 85), (2, 77))]
+    assert "geometry optimisation: 81.0%, ours 85.0%" in trials.page([*ours, *fewer])
+    assert "both have" not in trials.page([*ours, *(one | {"case": "inset"} for one in fewer)])
 
 
 def test_prediction_is_of_insertion_alone(trials):
