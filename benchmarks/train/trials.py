@@ -218,8 +218,8 @@ def beside_ours(rows: Sequence[Row]) -> list[str]:
     for (case, settings, spheres, steps), of in groups.items():
         ours = {
             row["seed"]: row
-            for (title, set_so, count, length), mine in groups.items()
-            if (title, set_so, length) == ("ours", settings, steps) and (count == spheres or on_surface(case))
+            for (other, given, count, length), mine in groups.items()
+            if (other, given, length) == ("ours", settings, steps) and (count == spheres or on_surface(case))
             for row in mine
         }
         pairs = [(row, ours[row["seed"]]) for row in of if row["seed"] in ours]
@@ -238,7 +238,7 @@ def beside_ours(rows: Sequence[Row]) -> list[str]:
 
 
 def on_surface(case: str) -> bool:
-    """Return whether a case has the paper's starting geometry, whose spheres ours has not, whatever their number."""
+    """Return whether a case has the paper's starting geometry, which never has as many spheres as ours."""
     return CASES[case].geometry == "surface"
 
 

@@ -74,7 +74,7 @@ def _edge_spheres(
 
     The last results are kept: each evaluation, rendering and training of one policy wants the same.
     """
-    of_body, centre, size, rubbing = (one.value for one in fitted)
+    owner, position, size, friction = (one.value for one in fitted)
     surfaces: dict[int, Surface] = {}
     for body, name in enumerate(bodies):
         try:
@@ -84,8 +84,8 @@ def _edge_spheres(
     area = sum(surface.area for surface in surfaces.values())
     parts = []
     for body, surface in surfaces.items():
-        own = np.flatnonzero(of_body == body)
-        near = centre[own[touched.value[own]]]
+        own = np.flatnonzero(owner == body)
+        near = position[own[touched.value[own]]]
         if not len(near):
             continue
         points, _ = surface.sample(CANDIDATES, np.random.default_rng(body))
@@ -94,13 +94,13 @@ def _edge_spheres(
         centres, radius = edge_spheres(surface, points, larger, count, cfg.radius, min_radius=0.1 * cfg.radius)
         beside = np.linalg.norm(centres[:, None] - near, axis=2).min(axis=1, initial=np.inf) < cfg.reach
         own_small = own[size[own] <= 2 * cfg.radius]
-        apart = np.linalg.norm(centres[:, None] - centre[own_small], axis=2).min(axis=1, initial=np.inf)
+        apart = np.linalg.norm(centres[:, None] - position[own_small], axis=2).min(axis=1, initial=np.inf)
         new = beside & (apart > cfg.gap)
         centres, radius = centres[new], radius[new]
-        closest = np.linalg.norm(centres[:, None] - centre[own], axis=2)
-        friction = rubbing[own[closest.argmin(axis=1)]] if len(centres) else np.empty(0)
-        moved = centres + displacement(surface, centre[own], size[own], closest)
-        parts.append((np.full(len(centres), body), moved, radius, friction))
+        closest = np.linalg.norm(centres[:, None] - position[own], axis=2)
+        nearest = friction[own[closest.argmin(axis=1)]] if len(centres) else np.empty(0)
+        moved = centres + displacement(surface, position[own], size[own], closest)
+        parts.append((np.full(len(centres), body), moved, radius, nearest))
     if not parts:
         return None
     return tuple(np.concatenate(values) for values in zip(*parts, strict=True))
