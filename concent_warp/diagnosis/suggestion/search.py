@@ -88,14 +88,14 @@ class Search:
             rated = self.menu()
         if method != "optimised":
             best = self._compared(rated)
-        if method == "optimised" or (method == "best" and (best is None or self.score(best[1]) < self.enough)):
+        if method == "optimised" or (method == "best" and not (best and self.suffices(best[1]))):
             searched = self.optimised()
             best = self._compared(searched, best)
             rated += searched
-        if method != "random" and self.cfg.payloads and not (best and self.decides(best[1])):
+        if method != "random" and self.cfg.payloads and not (best and self.suffices(best[1])):
             heavy = self.menu(loaded=True) if method != "optimised" else []
             best = self._compared(heavy, best)
-            if method != "menu" and (best is None or self.score(best[1]) < self.enough):
+            if method != "menu" and not (best and self.suffices(best[1])):
                 heavy += self.optimised(loaded=True)
                 best = self._compared(heavy, best)
             rated += heavy
@@ -139,9 +139,10 @@ class Search:
         """Return the score of a forecast."""
         return found.score(self.needed(found), self.cfg.clear_separation)
 
-    def decides(self, found: Forecast) -> bool:
-        """Return whether a motion with some forecast is expected to leave nothing open."""
-        return found.decides(self.needed(found), self.cfg.clear_separation)
+    def suffices(self, found: Forecast) -> bool:
+        """Return whether a motion with some forecast is expected to leave nothing open, so that no better is needed."""
+        needed, cfg = self.needed(found), self.cfg
+        return found.decides(needed, cfg.clear_separation) or found.decides(cfg.sufficient * needed, 0.0)
 
     def menu(self, *, loaded: bool = False) -> list[Rated]:
         """Return the motions of the menu in the surroundings as they are, `loaded` or not; several of an object

@@ -137,12 +137,15 @@ def test_a_weight_is_asked_for_where_no_motion_is_clear(found, tmp_path):
     assert ball["position"] == pytest.approx(weight["position"])
 
 
-def test_nothing_is_searched_where_the_menu_separates_by_far(menu, monkeypatch):
+def test_nothing_is_searched_where_the_menu_is_expected_to_decide(menu, monkeypatch):
     margin = min(pair.evidence for pair in menu.pairs) / menu.needed
-    assert min(pair.separation for pair in menu.pairs) > 0.01
-    monkeypatch.setattr(Search, "optimised", lambda *_: pytest.fail("searched"))
-    enough = replace(QUICK, enough=0.5 * margin, clear_separation=0.01)
-    assert suggest(MODEL, RECORDING, enough, diagnosis=open_group()).to_json() == menu.to_json()
+    least = replace(QUICK, sufficient=0.9 * margin, clear_separation=1e6)
+    searched, optimised = [], Search.optimised
+    monkeypatch.setattr(Search, "optimised", lambda self, **_: searched.append(1) or optimised(self))
+    assert suggest(MODEL, RECORDING, least, diagnosis=open_group()).to_json() == menu.to_json()
+    assert not searched
+    suggest(MODEL, RECORDING, replace(least, sufficient=1.1 * margin), diagnosis=open_group())
+    assert searched
 
 
 def test_a_search_ends_where_it_finds_nothing_better(monkeypatch):
