@@ -84,22 +84,23 @@ class Search:
         rated: list[Rated] = []
         if method == "random":
             rated = [self.random()]
-        if method in ("best", "menu"):
-            rated = self.menu()
-        if method != "optimised":
             best = self._compared(rated)
-        if method == "optimised" or (method == "best" and not (best and self.suffices(best[1]))):
-            searched = self.optimised()
-            best = self._compared(searched, best)
-            rated += searched
-        if method != "random" and self.cfg.payloads and not (best and self.suffices(best[1])):
-            heavy = self.menu(loaded=True) if method != "optimised" else []
-            best = self._compared(heavy, best)
-            if method != "menu" and not (best and self.suffices(best[1])):
-                heavy += self.optimised(loaded=True)
-                best = self._compared(heavy, best)
-            rated += heavy
+        for loaded in (False, True) if method in ("best", "menu") else ():
+            if not loaded or self._asks_for_weights(best):
+                found = self.menu(loaded=loaded)
+                best = self._compared(found, best)
+                rated += found
+        for loaded in (False, True) if method in ("best", "optimised") else ():
+            enough = method == "best" and best is not None and self.suffices(best[1])
+            if not enough and (not loaded or self._asks_for_weights(best)):
+                found = self.optimised(loaded=loaded)
+                best = self._compared(found, best)
+                rated += found
         return Found(best, min(rated, key=lambda r: r.excess).words if rated else ())
+
+    def _asks_for_weights(self, best: tuple[Candidate, Forecast] | None) -> bool:
+        """Return whether motions with known weights are tried beside the best one without."""
+        return self.cfg.payloads and not (best and self.decides(best[1]))
 
     def _compared(
         self, rated: Sequence[Rated], best: tuple[Candidate, Forecast] | None = None
@@ -139,10 +140,13 @@ class Search:
         """Return the score of a forecast."""
         return found.score(self.needed(found), self.cfg.clear_separation)
 
+    def decides(self, found: Forecast) -> bool:
+        """Return whether a motion with some forecast is expected to leave nothing open."""
+        return found.decides(self.needed(found), self.cfg.clear_separation)
+
     def suffices(self, found: Forecast) -> bool:
-        """Return whether a motion with some forecast is expected to leave nothing open, so that no better is needed."""
-        needed, cfg = self.needed(found), self.cfg
-        return found.decides(needed, cfg.clear_separation) or found.decides(cfg.sufficient * needed, 0.0)
+        """Return whether a motion with some forecast is expected to decide so much that none is searched."""
+        return self.decides(found) or found.decides(self.cfg.sufficient * self.needed(found), 0.0)
 
     def menu(self, *, loaded: bool = False) -> list[Rated]:
         """Return the motions of the menu in the surroundings as they are, `loaded` or not; several of an object
