@@ -180,6 +180,8 @@ def compare_replays(
     found, diverged, partners = {}, {}, {}
     moving: dict[str, dict[str | None, tuple[Phase, ...]]] = {}
     last, tolerances = tuple(models)[-1], {}
+    report = progress or (lambda _: None)
+    whole = len(models) + (tolerance_cfg.draws if tolerance_cfg is not None else 0)
     for name, model in models.items():
         simulator = make_engine(engine, model)
         compiled = model.compile()
@@ -195,11 +197,21 @@ def compare_replays(
                 partners[d.name] = ContactPartners.of_replay(model, compiled, rollout)
                 ctrl = commands(compiled, d, len(rollout.step) - 1)
                 moving[d.name] = phases_by_body(model, compiled, rollout, motion_cfg, ctrl)
-            if progress is not None:
-                progress(len(found) / (len(models) * len(chosen)))
+            report(len(found) / (whole * len(chosen)))
         if name == last and tolerance_cfg is not None:
             mine = {d.name: found[last, d.name] for d in begun}
-            tolerances = tolerance_ranges(model, begun, mine, noise, engine, tolerance_cfg, residual_cfg, seed)
+            replayed = len(models) / whole
+            tolerances = tolerance_ranges(
+                model,
+                begun,
+                mine,
+                noise,
+                engine,
+                tolerance_cfg,
+                residual_cfg,
+                seed,
+                lambda share, done=replayed: report(done + (1 - done) * share),
+            )
     if not any(found.values()):
         raise RecordingError("nothing was measured that could be compared with a model", where=recording.source)
     staged = phases or {}
@@ -215,6 +227,7 @@ def compare_replays(
             found[last, d.name], moving.get(d.name, {None: ()}), partners[d.name], d.name, span_cfg
         )
     ]
+    report(1.0)
     return Comparison(
         models=dict(models),
         demonstrations=tuple(d.name for d in chosen),

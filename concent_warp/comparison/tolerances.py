@@ -7,7 +7,7 @@ from a few replays of models whose nominal values are all drawn from their toler
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,6 +66,7 @@ def tolerance_ranges(
     cfg: ToleranceCfg | None = None,
     residual_cfg: ResidualCfg | None = None,
     seed: int = 0,
+    progress: Callable[[float], None] | None = None,
 ) -> dict[str, ToleranceRange]:
     """Return what ordinary errors of a model's nominal values alone would leave, by channel.
 
@@ -81,6 +82,7 @@ def tolerance_ranges(
         cfg: Settings.
         residual_cfg: Settings of the residuals.
         seed: Seed of the draws.
+        progress: Called with the share done, 0..1, after each draw.
     """
     cfg = cfg or ToleranceCfg()
     steps = sum(step_count(d, model.scene.model.opt.timestep) for d in demonstrations)
@@ -91,7 +93,7 @@ def tolerance_ranges(
     rng, plain = np.random.default_rng(seed), model.compile()
     bounds = [np.array([[p.low, p.null, p.high, p.scale] for p in kind.parameters(plain)]).T for kind in kinds]
     ratios: dict[str, list[float]] = {}
-    for _ in range(draws):
+    for k in range(draws):
         drawn = (
             AddedEffect(kind, tuple(np.clip(rng.normal(null, PRIOR_SCALES * scale), low, high).tolist()))
             for kind, (low, null, high, scale) in zip(kinds, bounds, strict=True)
@@ -99,6 +101,8 @@ def tolerance_ranges(
         other = replace(model, effects=(*model.effects, *drawn))
         for channel, ratio in _changes(other, demonstrations, found, noise, engine, residual_cfg).items():
             ratios.setdefault(channel, []).append(float(np.hypot(1.0, ratio)))
+        if progress is not None:
+            progress((k + 1) / draws)
     return {channel: ToleranceRange(min(of), max(of)) for channel, of in ratios.items()}
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import Phase
 from concent_warp.comparison.table import markdown_table, rich_table
+from concent_warp.comparison.tolerances import ToleranceCfg
 from concent_warp.comparison.units import ratio_text, value_text
 from concent_warp.effects.library.drives import ActuatorDelay
 from concent_warp.effects.library.measurement import Latency
@@ -110,6 +111,15 @@ def test_before_is_the_first_model_and_the_fall_of_the_error_is_significant(comp
     before = comparison.summarise("wrong", "rail").mean
     assert difference.share == pytest.approx(difference.mean / before)
     assert comparison.difference("rail", before="right", after="wrong").verdict == "risen"
+
+
+def test_the_draws_of_tolerances_count_in_the_progress():
+    shares, drawn = [], ToleranceCfg(draws=4, min_ratio=1.0)
+    compare_replays({"wrong": model(6)}, recorded(model(2)), "mujoco", tolerance_cfg=drawn, progress=shares.append)
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
+    shares.clear()
+    compare_replays({"right": model(2)}, recorded(model(2)), "mujoco", progress=shares.append)
+    assert shares == [1.0, 1.0]
 
 
 def test_two_equal_models_differ_by_nothing():

@@ -96,9 +96,9 @@ class SuggestCfg:
     """Evidence over what is needed from which on no better motion is looked for [-]: of all pairs of hypotheses, as the
     search averages them."""
     sufficient: Positive = 2.0
-    """Evidence over what is needed, for each pair, from which on a motion of the menu is taken without a search, however
-    small the differences of the predictions are [-]: recordings of longer motions decide no more, and take longer to
-    diagnose. Empirical."""
+    """Evidence over what is needed, for each pair, from which on a motion of the menu is taken without a search,
+    however small the differences of the predictions are [-]: recordings of longer motions decide no more, and take
+    longer to diagnose. Empirical."""
     patience: Count = 3
     """Batches without a better trajectory after which a search ends."""
     min_gain: Positive = 0.01

@@ -44,6 +44,8 @@ from concent_warp.simulate.select import EngineName
 
 EVALUATIONS_FILE = "evaluations.jsonl"
 """Scores of motions and fits of hypotheses in the folder of an unfinished search."""
+WIDENED = 4.0
+"""By how much limits may be widened at most, as is taken where no motion within them decides [-]."""
 
 Progress = Callable[[float, str], None]
 
@@ -225,7 +227,7 @@ def _searched(
         most = max(pairs, key=lambda pair: pair.evidence)
         return Suggestion(
             f"No motion within the limits separates {' and '.join(models)}: the best, {candidate.name}, is "
-            f"expected to bring {most.evidence:.2g} nat, of {enough:.2g} needed. Wider limits may do.",
+            f"expected to bring {most.evidence:.2g} nat, of {enough:.2g} needed. {_wider(most.evidence / enough)}",
             question.sentence,
             pairs=pairs,
             needed=enough,
@@ -311,6 +313,20 @@ def _suggestion(
         channel=strongest.channel,
         models={h.name: h.model for h in hypotheses},
         recording=motion_recording(recorded, candidate, first.model, engine),
+    )
+
+
+def _wider(share: float) -> str:
+    """Return what wider limits promise, in a sentence.
+
+    Args:
+        share: Evidence of the best motion within the limits over what is needed [-].
+    """
+    if share >= 1 / WIDENED**2:
+        return "Wider limits may do."
+    return (
+        f"Limits {WIDENED:g} times as wide would hardly do either: evidence grows about with their square. A sensor "
+        "that shows one of them apart from the other may, or a value that is measured by itself."
     )
 
 

@@ -21,7 +21,7 @@ from tests.diagnosis.suggestion.carts import one_speed, open_group
 
 RECORDING = one_speed(friction=0.2)
 MODEL = Model(Scene(RECORDING.scene))
-QUICK = SuggestCfg(payloads=False, evaluations=16, population=8, duration=3.0)
+QUICK = SuggestCfg(payloads=False, evaluations=16, population=8, duration=3.0, sufficient=1e6)
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +67,15 @@ def test_a_motion_by_chance_is_suggested_even_where_it_is_expected_to_decide_not
     assert chance.found
     assert not any(pair.resolved for pair in chance.pairs)
     assert "expected to decide nothing" in chance.sentence
+
+
+def test_wider_limits_are_proposed_where_they_may_bring_what_is_needed(menu):
+    most = max(pair.evidence for pair in menu.pairs) / menu.needed
+    for share, text in ((0.9, "Wider limits may do."), (0.01, "would hardly do either")):
+        far = replace(QUICK, method="menu", decisive=QUICK.decisive * most / share)
+        nothing = suggest(MODEL, RECORDING, far, diagnosis=open_group())
+        assert not nothing.found
+        assert text in nothing.sentence
 
 
 def test_nothing_is_suggested_where_no_motion_is_within_the_limits():
