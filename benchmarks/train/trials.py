@@ -92,10 +92,9 @@ another on one GPU beside 15 diagnoses (263, 482 and 489 s of learning), and are
 
 Without a fit of the contact geometry (`--cases inset --edges 400`, default settings; trials with `--case inset`) seeds
 40 to 44 were trained on 2026-11-29. The policies of 43 and 44 (100 and 99.8 % in simulation) were left behind on the
-machine, and a second training of 43 was cut off. A third one of 43, on 2026-11-30, is in the table; a second one of 44
-was cut off, too, and was not tried. The settings were chosen with fitted geometry. From other initial states the
-policies of 40 to 42 succeed in 198, 200 and 198 of 200 trials (`concent evaluate --checkpoint POLICY --world reality
---episodes 200`).
+machine, and a second training of each was cut off. The third one of each, on 2026-11-30, is in the table. The settings
+were chosen with fitted geometry. From other initial states the policies of 40 to 42 succeed in 198, 200 and 198 of 200
+trials (`concent evaluate --checkpoint POLICY --world reality --episodes 200`).
 
 With the engineered reward in place of the contact events (`--cases engineered --edges 400`, default settings; trials
 with `--case engineered`) seeds 40 to 49 were trained on 2026-11-29, each on one H200, 40 to 44 beside 14 diagnoses and
