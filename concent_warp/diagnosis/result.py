@@ -160,6 +160,8 @@ class HoldingFriction:
     """Lower end of the 95 % interval of the gain."""
     high: float
     """Upper end."""
+    beside: str = ""
+    """Effect that was fitted with and without them, and is not part of the gain; empty for none."""
 
     @property
     def sentence(self) -> str:
@@ -169,15 +171,16 @@ class HoldingFriction:
             what = f"contact friction depends on the direction, by the simulator's default: with {values} it does not"
         else:
             what = f"dry friction in {self.where} creeps, by default constants of the simulator: with {values} it holds"
+        beside = f", {self.beside} fitted in both" if self.beside else ""
         return (
             f"The model's {what}, and the held-out error falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, "
-            f"{100 * self.high:.0f}]; the diagnosis uses it."
+            f"{100 * self.high:.0f}]{beside}; the diagnosis uses it."
         )
 
     def to_json(self) -> dict[str, Any]:
         """Return it in plain types."""
         gain = {"value": self.gain, "interval": [self.low, self.high]}
-        return {"where": self.where, "settings": dict(self.settings), "gain": gain}
+        return {"where": self.where, "settings": dict(self.settings), "gain": gain, "beside": self.beside}
 
 
 @dataclass(frozen=True)

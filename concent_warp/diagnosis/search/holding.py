@@ -1,7 +1,9 @@
 """Dry friction that creeps, or depends on direction, by the simulator's default constants: no missing effect.
 
 Where a model leaves these constants at their defaults, the same model with friction that holds, or with elliptic cones,
-is a rival of every effect; it has no parameters and therefore comes first where it explains more.
+is a rival of every effect; it has no parameters and therefore comes first where it explains more. A coefficient of
+friction that is wrong hides what the cones do: with a pyramid no coefficient fits, and with an ellipse the wrong one
+may fit worse. Cones are therefore compared beside a fitted coefficient, too.
 """
 
 from __future__ import annotations
@@ -12,15 +14,20 @@ from typing import get_args
 
 import numpy as np
 
-from concent_warp.diagnosis.candidates.baseline import errors_like
+from concent_warp.diagnosis.candidates.baseline import errors_like, fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.candidates import candidates
 from concent_warp.diagnosis.candidates.screening import robust_sum
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
 from concent_warp.diagnosis.result import HoldingFriction
 from concent_warp.diagnosis.search.time_step import explains_more, projected_residuals, refitted, renew_defects
+from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval
 from concent_warp.scene.holding import Holding, contact_constants, joint_constants, with_holding_friction
 from concent_warp.scene.scene import Scene
+
+COEFFICIENT = "sliding_friction"
+"""Effect beside which cones are compared."""
 
 
 def hold(
@@ -35,8 +42,13 @@ def hold(
     """
     found, tried = tuple(known), {h.where for h in known}
     for where in get_args(Holding):
-        if where not in tried and (better := _holding(base, where, cfg)) is not None:
+        if where in tried:
+            continue
+        if (better := _holding(base, where, cfg)) is not None:
             found, base = (*found, _finding(base, better, where, cfg.seed)), better
+        elif where == "cones" and (pair := _beside_coefficient(base, where, cfg)) is not None:
+            one, better, base = pair
+            found = (*found, replace(_finding(one, better, where, cfg.seed), beside=COEFFICIENT))
     return base, found
 
 
@@ -58,6 +70,33 @@ def _holding(base: FittedModel, where: Holding, cfg: DiagnoseCfg) -> FittedModel
         return None
     found = renew_defects(refitted(other), cfg.time_step)
     return found if explains_more(base, found, cfg) else None
+
+
+def _beside_coefficient(
+    base: FittedModel, where: Holding, cfg: DiagnoseCfg
+) -> tuple[FittedModel, FittedModel, FittedModel] | None:
+    """Return fitted models with other friction where a coefficient of friction explains significantly more with it.
+
+    They are the model as it is and the one with other friction, both with a fitted coefficient, and the latter without;
+    None where the other friction explains no more, or where no coefficient may be wrong.
+    """
+    scene = with_holding_friction(base.model.scene, where)
+    kinds = [] if scene is None else candidates(base.model, (), (COEFFICIENT,))
+    if scene is None or not kinds:
+        return None
+    other = replace(base, model=replace(base.model, scene=scene))
+    without, with_it = (_with_effect(one, kinds[0]) for one in (base, other))
+    if not (explains_more(without, with_it, cfg) and explains_more(base, with_it, cfg)):
+        return None
+    return without, with_it, renew_defects(refitted(other), cfg.time_step)
+
+
+def _with_effect(base: FittedModel, effect: Effect) -> FittedModel:
+    """Return a fitted model with one effect more, all parameters fitted."""
+    solver = base.solver(effect)
+    start = np.concatenate([base.fit.values, solver.p.start[solver.p.owned :]])
+    fit = solver.improve_initial_states(solver.fit(start, base.fit.offsets, base.fit.starts), [])
+    return fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
 
 
 def _finding(base: FittedModel, better: FittedModel, where: Holding, seed: int) -> HoldingFriction:

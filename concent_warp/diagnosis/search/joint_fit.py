@@ -26,10 +26,11 @@ from concent_warp.fit.effects.prediction import Prediction
 
 def refit_jointly(last: FittedModel) -> FittedModel:
     """Return a model with all parameters and initial states fitted together once more, where that lowers the cost."""
-    if last.fit.polished:
-        return last
     solver = last.solver()
-    fit = solver.polish(last.fit, thorough=True)
+    begun = solver.better_from_measured_states(last.fit)
+    if begun.polished:
+        return last
+    fit = solver.polish(begun, thorough=True)
     if fit.cost >= last.fit.cost:
         return last
     return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)

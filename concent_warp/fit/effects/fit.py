@@ -161,6 +161,7 @@ def fit_effects(
         report(0.8, "fitting from other values")
         fit = min(fit, solver.fit(other, offsets, starts), key=lambda found: found.cost)
     report(0.8, "fitting again")
+    fit = solver.better_from_measured_states(fit)
     fit = solver.polish(fit)
     linear = projected(fit, robust)
     found = [window_linear.residual for window_linear in linear]

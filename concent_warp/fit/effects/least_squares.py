@@ -67,6 +67,9 @@ class LeastSquaresCfg:
     same_state: float = 0.3
     """Largest difference of two initial states, in units of their spread, below which a search from one ends where that
     from the other does [-]. Empirical."""
+    far_state: Positive = 5.0
+    """Error of an initial state, in units of its spread, beyond which another fit begins at the measured states, where
+    there are contacts [-]: such a state may make up for a wrong parameter, and then no step leads away. Empirical."""
     together_ratio: float = 1.1
     """Residual over noise below which a polish moves parameters and initial states together [-]: little is left that
     other initial states could hide. Empirical."""
@@ -372,6 +375,21 @@ class Solver:
             if converged:
                 break
         return best
+
+    def better_from_measured_states(self, fit: Fit) -> Fit:
+        """Return the better of a fit whose initial states are far from the measured ones and one that begins at these.
+
+        The parameters are fitted at the measured states first. A velocity that is too high goes with a friction that
+        is: from such states a fit does not find back. Without contacts, or near the measured states, it is returned as
+        it is.
+        """
+        if not len(fit.values) or all(w.smooth for w in self.p.windows):
+            return fit
+        if max(float(np.abs(o).max(initial=0.0)) for o in fit.offsets) <= self.cfg.far_state:
+            return fit
+        measured = [np.zeros_like(o) for o in fit.offsets]
+        there = self.fit_at_states_of(replace(fit, offsets=tuple(measured)), fit)
+        return min(fit, self.fit(there.values, *self.fit_initial_states(there.values, measured)), key=lambda f: f.cost)
 
     def first_order_offsets(self, fit: Fit, move: np.ndarray) -> list[np.ndarray]:
         """Return the errors of the initial states that go with a step of the parameters, to first order.

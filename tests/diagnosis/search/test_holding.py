@@ -155,6 +155,41 @@ def test_friction_that_depends_on_the_direction_by_default_is_no_effect():
     assert hold(base, (), CFG) == (base, ())
 
 
+SLIDING = (
+    "<mujoco><option timestep='.002'/><worldbody><geom name='table' type='plane' size='1 1 .1' friction='.3'/>"
+    "<body name='puck' pos='0 0 .01'><freejoint/><geom type='cylinder' size='.03 .01' mass='.15' friction='.3'/></body>"
+    "</worldbody><sensor><framepos name='place' objtype='body' objname='puck'/></sensor></mujoco>"
+)
+
+
+def thrown(coefficient: float) -> Recording:
+    """Return slides of a puck, seen from above, that Coulomb friction slows down: in its formula, not in MuJoCo."""
+    rng, time, demonstrations = np.random.default_rng(8), np.arange(0, 0.7, 0.01), []
+    for k, velocity in enumerate(np.array([[1.4, 0.2], [-1.1, -0.5]])):
+        speed = float(np.linalg.norm(velocity))
+        gone = np.minimum(time, speed / (9.81 * coefficient))
+        way = speed * gone - 0.5 * 9.81 * coefficient * gone**2
+        place = np.full((len(time), 3), np.nan)
+        place[:, :2] = velocity / speed * way[:, None] + rng.normal(0, 5e-4, (len(time), 2))
+        measured = {"place": Channel(time, place, noise_std=5e-4)}
+        demonstrations.append(Demonstration(f"demo_{k}", measured=measured))
+    return Recording(SLIDING, tuple(demonstrations))
+
+
+def test_cones_are_compared_beside_a_coefficient_that_may_be_wrong():
+    base = fitted(thrown(0.22))
+    found, (said, *_) = hold(base, (), CFG)
+    assert (said.where, said.settings, said.beside) == ("cones", {"cone": "elliptic"}, "sliding_friction")
+    assert found.model.scene.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert not found.model.effects
+    assert "sliding_friction fitted in both" in said.sentence
+    recording = thrown(0.22)
+    answer = cw.diagnose(Model(Scene(SLIDING)), recording, replace(CFG, effects=("sliding_friction", "gravity_tilt")))
+    (effect,) = answer.accepted
+    assert effect.name == "sliding_friction"
+    assert effect.parameters[0].low < 0.22 < effect.parameters[0].high
+
+
 def test_friction_that_holds_is_tried_again_beside_each_effect(monkeypatch: Any):
     made, asked = procedure(max_additions=1), []
     nodes = [node(3.0), node(1.5, effects=1), node(1.0, effects=1)]
