@@ -18,6 +18,9 @@ from concent_warp.effects.table import checked_values, effects_table, posteriors
 from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none, write_text
 from concent_warp.recording.recording import Recording
+from concent_warp.recording.validation.location import ErrorLocation
+from concent_warp.recording.validation.scene_text import check_is_mjcf
+from concent_warp.recording.validation.validate import check_contents, check_is_recording
 from concent_warp.scene.payloads import Payload, scene_with_payloads
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.objects import load_object
@@ -78,7 +81,13 @@ class Model:
 
     @staticmethod
     def from_recording(recording: Recording) -> Model:
-        """Return the model of a recording's scene, without contact geometry and effects."""
+        """Return the model of a recording's scene, without contact geometry and effects.
+
+        Raises:
+            RecordingError: This is not a recording, or its scene is not MJCF text.
+        """
+        check_is_recording(recording)
+        check_is_mjcf(recording.scene, ErrorLocation(recording.source, channel="scene"))
         return Model(Scene(recording.scene, source=recording.source))
 
     def spec(self, collidable: np.ndarray | None = None) -> mujoco.MjSpec:
@@ -164,28 +173,31 @@ class Model:
         return model
 
     def check_recording(self, recording: Recording) -> None:
-        """Check that a recording can be of this model.
+        """Check that a recording is consistent, fits its own scene, and can be of this model.
 
         Raises:
+            RecordingError: The recording contradicts itself or its scene; with demonstration, channel and row.
             ModelError: Other actuators were commanded than the model has, or the initial state has another number of
                 positions.
         """
+        check_is_recording(recording)
         compiled = self.scene.model
+        check_contents(recording, compiled if recording.scene == self.scene.xml else None)
         actuators = sorted(compiled.actuator(i).name for i in range(compiled.nu))
         for demonstration in recording.demonstrations:
             commanded = sorted(demonstration.action)
             if commanded != actuators:
-                raise self._refusal(recording, f"actuators {commanded}", actuators)
+                raise self._refusal(recording, f"actuators {actuators}", commanded)
             if demonstration.qpos is not None and len(demonstration.qpos) != compiled.nq:
-                raise self._refusal(recording, f"{len(demonstration.qpos)} positions in the state", compiled.nq)
+                raise self._refusal(recording, f"{compiled.nq} positions in the state", len(demonstration.qpos))
 
-    def _refusal(self, recording: Recording, expected: str, found: object) -> ModelError:
-        """Return the error that says how model and recording differ."""
+    def _refusal(self, recording: Recording, has: str, found: object) -> ModelError:
+        """Return the error that says what the model has and what was found in the recording instead."""
         return ModelError(
             f"the model is of another robot or scene than the recording {recording.source}",
             where=self.scene.source,
-            expected=expected,
-            found=found,
+            expected=f"{has} as in the model",
+            found=f"{found} in the recording",
             fix="give a model made from this recording's scene",
         )
 
@@ -339,3 +351,22 @@ def model_with_spheres(
             surfaces[name] = found.surface
         scene = Scene.from_spec(spec, source=scene.source)
     return Model(scene, (cfg or ContactGeometryCfg()).build(scene, objects or None, surfaces=surfaces))
+
+
+def check_inputs(model: Model, recording: Recording) -> None:
+    """Check what a public function was given: a model, and a recording that can be of it.
+
+    Raises:
+        ModelError: This is not a model, or it is of another robot or scene, see `Model.check_recording`.
+        RecordingError: This is not a recording, or it contradicts itself.
+    """
+    if not isinstance(model, Model):
+        path = isinstance(model, str | Path)
+        raise ModelError(
+            "this is not a model",
+            where=model if path else None,
+            expected="a Model",
+            found=type(model).__name__,
+            fix="read the file with load_model first" if path else None,
+        )
+    model.check_recording(recording)

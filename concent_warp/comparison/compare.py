@@ -19,9 +19,9 @@ from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.tolerances import ToleranceCfg, tolerance_ranges
 from concent_warp.comparison.worst_spans import WorstSpanCfg, find_worst_spans, rank_worst_spans
 from concent_warp.errors import EventsError, ModelError, RecordingError
-from concent_warp.events.extract_events import extract_events
+from concent_warp.events.extract_events import events_of
 from concent_warp.files import write_json
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.simulate.replay import commands, replay
 from concent_warp.simulate.select import EngineName, make_engine
 
@@ -86,7 +86,8 @@ def compare(
 
     Raises:
         ModelError: There is no model, or a model is of another robot than the recording.
-        RecordingError: There is no such demonstration, or it measures nothing, or what a model does not.
+        RecordingError: There is no such demonstration, or it measures nothing, or what a model does not; or the
+            recording contradicts itself or its scene.
         EngineError: A model cannot be simulated.
 
     Example:
@@ -100,15 +101,15 @@ def compare(
     """
     cfg = cfg or CompareCfg()
     check_settings(cfg)
-    named = {"model": models} if isinstance(models, Model) else dict(models)
+    named = dict(models) if isinstance(models, Mapping) else {"model": models}
     for model in named.values():
-        model.check_recording(recording)
+        check_inputs(model, recording)
     chosen = recording.only(cfg.demonstrations)
     remarks: tuple[str, ...] = ()
     if events is None and cfg.phases == "auto" and named:
         try:
             last = list(named.values())[-1]
-            events = extract_events(last, with_initial_states(last, chosen, engine), engine=engine)
+            events = events_of(last, with_initial_states(last, chosen, engine), engine=engine)
         except EventsError as error:
             remarks = (f"No contact stages: {error}",)
     stages = {name: sequence.stages for name, sequence in (events or {}).items()}

@@ -12,7 +12,7 @@ from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.diagnosis.tasks import Progress, TaskRunner, ignore_progress
 from concent_warp.files import write_json
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import lock_folder, versions
 from concent_warp.simulate.select import EngineName
@@ -58,7 +58,7 @@ def diagnose(
         >>> diagnosis.verdict, diagnosis.groups
         ('effect', (('joint_friction',),))
     """
-    model.check_recording(recording)
+    check_inputs(model, recording)
     cfg, progress = cfg or DiagnoseCfg(), progress or ignore_progress
     check_settings(cfg)
     if out is None:

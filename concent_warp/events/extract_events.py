@@ -10,7 +10,7 @@ from concent_warp.events.extract import extract
 from concent_warp.events.schedule import plot_schedule
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import all_or_none
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName, make_engine
 
@@ -37,6 +37,8 @@ def extract_events(
         progress: Called with the share done, 0..1.
 
     Raises:
+        ModelError: The model is of another robot than the recording.
+        RecordingError: The recording contradicts itself or its scene.
         EventsError: The replay does not stay finite, or the model has no objects.
         EngineError: The model cannot be simulated.
 
@@ -47,16 +49,30 @@ def extract_events(
         >>> [stage.name for stage in events.stages]
         ['pick', 'align', 'insert']
     """
+    check_inputs(model, recording)
+    found = events_of(model, recording, cfg, engine=engine, progress=progress)
+    if out is not None:
+        folder = Path(out)
+        folder.mkdir(parents=True, exist_ok=True)
+        save_events(found, folder)
+    return found
+
+
+def events_of(
+    model: Model,
+    recording: Recording,
+    cfg: StagingCfg | None = None,
+    *,
+    engine: EngineName = "mujoco",
+    progress: Callable[[float], None] | None = None,
+) -> dict[str, ContactEventSequence]:
+    """Return the same as `extract_events` of a recording that was checked, whatever its initial states became since."""
     simulator = make_engine(engine, model)
     found = {}
     for k, d in enumerate(recording.demonstrations):
         found[d.name] = extract(model, d, simulator, cfg)
         if progress is not None:
             progress((k + 1) / len(recording.demonstrations))
-    if out is not None:
-        folder = Path(out)
-        folder.mkdir(parents=True, exist_ok=True)
-        save_events(found, folder)
     return found
 
 

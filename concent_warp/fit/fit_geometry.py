@@ -16,7 +16,7 @@ from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.search import FitResult, GeometrySearchCfg, Progress, Search
 from concent_warp.fit.newton.descent import GradientCfg
 from concent_warp.fit.newton.warm_start import GradientWarmStart
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.run_folder import CHECKPOINT, make_folder
 from concent_warp.scene.spheres.build import ContactGeometryCfg
@@ -85,7 +85,7 @@ def fit_geometry(
     """
     cfg = cfg or FitCfg()
     check_settings(cfg)
-    model.check_recording(recording)
+    check_inputs(model, recording)
     if model.geometry is None:
         model = model.with_geometry((start or ContactGeometryCfg()).build(model.scene))
     folder = None if out is None else Path(out)

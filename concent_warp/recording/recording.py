@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.recording.arrays import as_array
 from concent_warp.scene.payloads import Payload
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One commanded or measured signal.
+    """One commanded or measured signal; lists and whole numbers become arrays of floating-point numbers.
 
     Example:
         >>> import concent_warp as cw
@@ -43,6 +44,9 @@ class Channel:
     """What of it the samples share, shape (T, k, m): how each error that all samples of the channel have in common
     changes a sample, per standard deviation of that error. ``common @ common.T`` is a part of each covariance."""
 
+    def __post_init__(self) -> None:
+        _set_arrays(self, ("time", "value", "covariance", "common"))
+
 
 @dataclass(frozen=True)
 class PointTrack:
@@ -62,6 +66,9 @@ class PointTrack:
     """Point positions [m], world frame, shape (T, M, 3); point m is the same material point in every frame."""
     visible: np.ndarray
     """Whether a point was seen in a frame, shape (T, M), bool."""
+
+    def __post_init__(self) -> None:
+        _set_arrays(self, ("time", "value", "visible"))
 
 
 @dataclass(frozen=True)
@@ -101,10 +108,15 @@ class PolicyLog:
     action: np.ndarray
     """Its actions, -1..1, shape (T, A)."""
 
+    def __post_init__(self) -> None:
+        _set_arrays(self, ("time", "observation", "action"))
+
 
 @dataclass(frozen=True)
 class Demonstration:
     """One execution of a task, or one toss, swing or push: everything recorded between start and stop.
+
+    Commands given with shape (T, 1) become (T,), measurements given with shape (T,) become (T, 1).
 
     Example:
         >>> import concent_warp as cw
@@ -133,6 +145,36 @@ class Demonstration:
     payloads: tuple[Payload, ...] = ()
     """Known weights that bodies carried, which the scene does not have."""
 
+    def __post_init__(self) -> None:
+        _set_arrays(self, ("qpos", "qvel"))
+        kinds = {"action": Channel, "measured": Channel, "points": PointTrack, "image": ImageStream}
+        for kind, expected in kinds.items():
+            streams = getattr(self, kind)
+            if not isinstance(streams, Mapping):
+                raise RecordingError(
+                    f"{kind} of demonstration {self.name!r} is not a dictionary",
+                    expected=f"a {expected.__name__} by name",
+                    found=type(streams).__name__,
+                )
+            for name, stream in streams.items():
+                if not isinstance(stream, expected):
+                    raise RecordingError(
+                        f"{kind}/{name} of demonstration {self.name!r} is not a {expected.__name__}",
+                        found=type(stream).__name__,
+                        fix=f"write {expected.__name__}(time, ...)",
+                    )
+        if any(one.value.ndim == 2 and one.value.shape[1] == 1 for one in self.action.values()):
+            flat = {
+                n: replace(c, value=c.value[:, 0]) if c.value.ndim == 2 and c.value.shape[1] == 1 else c
+                for n, c in self.action.items()
+            }
+            object.__setattr__(self, "action", flat)
+        if any(one.value.ndim == 1 for one in self.measured.values()):
+            columns = {
+                n: replace(c, value=c.value[:, None]) if c.value.ndim == 1 else c for n, c in self.measured.items()
+            }
+            object.__setattr__(self, "measured", columns)
+
     @property
     def duration(self) -> float:
         """Time of the last sample of any channel [s]."""
@@ -156,6 +198,21 @@ class Recording:
     demonstrations: tuple[Demonstration, ...]
     source: str = "<memory>"
     """File or folder that it came from, for messages."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scene, str):
+            raise RecordingError(
+                "the scene of a recording is not text", where=self.source, expected="MJCF text, such as Scene.xml",
+                found=type(self.scene).__name__,
+            )  # fmt: skip
+        given = self.demonstrations
+        if not isinstance(given, Sequence) or not all(isinstance(one, Demonstration) for one in given):
+            kinds = [type(one).__name__ for one in given] if isinstance(given, list | tuple) else type(given).__name__
+            raise RecordingError(
+                "the demonstrations of a recording are not a tuple of Demonstration", where=self.source, found=kinds,
+                fix="write Recording(scene, (demonstration,))",
+            )  # fmt: skip
+        object.__setattr__(self, "demonstrations", tuple(given))
 
     def __getitem__(self, name: str | int) -> Demonstration:
         """Return a demonstration by name or by position."""
@@ -225,3 +282,14 @@ class Recording:
                 found=loaded,
                 fix="leave these demonstrations out",
             )
+
+
+def _set_arrays(owner: object, names: Sequence[str]) -> None:
+    """Replace what the fields of a frozen dataclass hold by arrays, None excepted.
+
+    Raises:
+        RecordingError: A field holds what is no array, such as rows of unequal length.
+    """
+    for name in names:
+        if (given := getattr(owner, name)) is not None:
+            object.__setattr__(owner, name, as_array(given, f"{name} of a {type(owner).__name__}"))

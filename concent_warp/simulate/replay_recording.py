@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from concent_warp.files import all_or_none
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.engine import Rollout
 from concent_warp.simulate.replay import replay as replay_demonstration
@@ -41,6 +41,7 @@ def replay(
 
     Raises:
         ModelError: The model is of another robot than the recording.
+        RecordingError: The recording contradicts itself or its scene.
         EngineError: The model cannot be simulated.
 
     Example:
@@ -50,7 +51,7 @@ def replay(
         >>> rollout.qpos.shape[0], bool(rollout.diverged[0])
         (1, False)
     """
-    model.check_recording(recording)
+    check_inputs(model, recording)
     simulator = make_engine(engine, model)
     found = {}
     with all_or_none():

@@ -157,7 +157,7 @@ def test_a_model_of_another_robot_is_called_that(bench, tmp_path, monkeypatch, c
     assert main(given if command[0] == "add" else [*given, str(other)]) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert "of another robot or scene" in error
-    assert "expected actuators ['drive'], found ['motor']" in error
+    assert "expected actuators ['motor'] as in the model, found ['drive'] in the recording" in error
     assert [p.name for p in tmp_path.iterdir()] == ["other.xml"]
 
 
@@ -167,7 +167,9 @@ def test_a_model_with_more_bodies_than_were_recorded_is_refused(bench, tmp_path,
     text = model.scene.xml.replace("</worldbody>", "<body><freejoint/><geom size='.1'/></body></worldbody>")
     more.write_text(text)
     assert main(["compare", str(bench / "demo.h5"), "--model", str(more)]) == 2
-    assert "8 positions in the state, found 15" in " ".join(capsys.readouterr().err.split())
+    assert "15 positions in the state as in the model, found 8 in the recording" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,7 @@ def test_radii_move_when_asked(drop, swollen):
 
 def test_a_recording_that_observes_nothing_is_refused(drop, swollen):
     blind = Recording(drop.scene, (replace(drop[0], points={}),))
-    with pytest.raises(RecordingError, match="nothing to fit to"):
+    with pytest.raises(RecordingError, match="the demonstration is empty"):
         fit_geometry(swollen, blind, CFG)
 
 

@@ -71,9 +71,9 @@ CHANNELS = {
         ("measured", "block_position", {"value": lambda v: v[:, :2]}),
         r"\(50, 3\), found \(50, 2\)",
     ),
-    "flat measurement": (
-        ("measured", "elbow_angle", {"value": lambda v: v[:, 0]}),
-        r"\(50, 1\), found \(50,\)",
+    "two columns": (
+        ("measured", "elbow_angle", {"value": lambda v: np.hstack([v, v])}),
+        r"\(50, 1\), found \(50, 2\)",
     ),
     "short values": (("action", "elbow", {"value": lambda v: v[:-1]}), r"expected \(50,\), found \(49,\)"),
     "text values": (("action", "elbow", {"value": lambda v: v.astype("U8")}), "wrong shape of the values"),

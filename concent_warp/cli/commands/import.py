@@ -19,7 +19,7 @@ from concent_warp.files import write_text
 from concent_warp.recording.logs.cfg import BopCfg, ImportCfg, PlausibilityCfg
 from concent_warp.recording.logs.episode import ReadChannel
 from concent_warp.recording.logs.import_log import import_log, inspect_log
-from concent_warp.recording.logs.suggest import suggest_map
+from concent_warp.recording.logs.suggest import GAP, suggest_map
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import claim_file, make_folder
 
@@ -75,7 +75,10 @@ def run(arguments: Arguments) -> Recording | None:
         text = suggest_map(arguments.source, arguments.model, numbers[0] if numbers else None)
         make_folder(arguments.mapping.parent)
         write_text(arguments.mapping, text)
-        guesses = text.count("# guess") + text.count("# no channel found")
+        gaps = [line.removeprefix(GAP) for line in text.splitlines() if line.startswith(GAP)]
+        for gap in gaps:
+            say(escape(f"the scene lacks something: {gap}"))
+        guesses = text.count("# guess") + text.count("# no channel found") + len(gaps)
         say(f"{guesses} guesses or gaps are marked; check them, and all units and signs, with --dry-run")
         say_written(arguments.mapping)
         return None

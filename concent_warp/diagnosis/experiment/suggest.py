@@ -31,7 +31,7 @@ from concent_warp.files import write_json
 from concent_warp.fit.effects.observation import ObservedRecording, Window
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
 
@@ -72,6 +72,8 @@ def suggest_experiment(
     cfg = cfg or SuggestExperimentCfg()
     check_settings(cfg)
     chosen = dict(list(models.items())[: cfg.max_hypotheses])
+    for model in chosen.values():
+        check_inputs(model, recording)
     if len(chosen) < 2:
         return None
     first = next(iter(chosen.values()))

@@ -21,10 +21,10 @@ from concent_warp.diagnosis.forces.window_forces import Windows, window_forces, 
 from concent_warp.effects.select import driven_joints
 from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
 from concent_warp.files import write_json
+from concent_warp.model import Model, check_inputs
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
-    from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
 
 
@@ -60,6 +60,7 @@ def locate_forces(
     """
     cfg = cfg or LocateForcesCfg()
     check_settings(cfg)
+    check_inputs(model, recording)
     simulator = make_engine(engine, model)
     chosen = recording.demonstrations
     motions = [StateEstimator.of(model, d, StateEstimatorCfg("smoothing_spline"), engine=simulator) for d in chosen]

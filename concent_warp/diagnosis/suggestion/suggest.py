@@ -37,7 +37,7 @@ from concent_warp.effects.effect import AddedEffect
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.fit.effects.observe import channel_noises
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.run_folder import make_folder, plain, versions
 from concent_warp.simulate.select import EngineName
@@ -99,7 +99,7 @@ def suggest(
     cfg, report = cfg or SuggestCfg(), progress or _ignore
     check_settings(cfg)
     check_workspace(cfg.limits)
-    model.check_recording(recording)
+    check_inputs(model, recording)
     folder = None if state is None else Path(state)
     if folder is not None:
         make_folder(folder)

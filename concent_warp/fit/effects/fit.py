@@ -31,7 +31,7 @@ from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
-from concent_warp.model import Model
+from concent_warp.model import Model, check_inputs
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
 
@@ -142,6 +142,7 @@ def fit_effects(
     """
     cfg = cfg or FitEffectsCfg()
     check_settings(cfg)
+    check_inputs(model, recording)
     if not model.effects:
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
     report = progress or _silent

@@ -35,6 +35,9 @@ class PlausibilityCfg:
     clocks [s]."""
     max_repeated: Share = 0.1
     """Share of samples with the stamp of another one above which a clock stands still [-]."""
+    max_back_step: Factor = 3.0
+    """Step back of a clock above which it was set or started anew, in median periods of its channel [-]; samples that
+    are out of order by less are sorted."""
     depth_bounds: tuple[float, float] = (0.02, 20.0)
     """Medians of depth that RGB-D cameras have [m]."""
     depth_grid: Annotated[int, Bounds(2, 64)] = 12

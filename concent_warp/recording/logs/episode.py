@@ -17,6 +17,7 @@ from concent_warp.recording.logs.numbers import Numbers, converted, expanded
 from concent_warp.recording.logs.plausibility import check_delays, check_numbers, check_overlap
 from concent_warp.recording.logs.readers.calibration import Calibration
 from concent_warp.recording.logs.readers.log import Episode
+from concent_warp.recording.logs.scene_gaps import nameless_actuators
 from concent_warp.recording.logs.targets import Target, body_sensors, joint_positions, targets_of
 from concent_warp.recording.logs.units import SI
 from concent_warp.recording.naming import PREFIX
@@ -55,6 +56,8 @@ class ReadEpisode:
     problems: list[RecordingError] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
     """Channels of the log that the map does not name."""
+    behind: dict[str, int] = field(default_factory=dict)
+    """Samples that were out of order and were sorted, by kind and name of their channel."""
 
     def with_images(self, tick: Callable[[str, int], None]) -> Demonstration:
         """Decode all frames; `tick` is called with a camera and its number of frames done."""
@@ -80,7 +83,7 @@ def read_episode(
         The demonstration and all that is wrong, in the order in which it is best mended.
     """
     problems: list[RecordingError] = []
-    channels, constants = _numbers(episode, mapping, m, cfg, problems)
+    channels, constants, wrong = _numbers(episode, mapping, m, cfg, problems)
     cameras: list[Camera] = []
     for name, entry in mapping.image.items():
         try:
@@ -99,7 +102,9 @@ def read_episode(
     action, measured = _channels(channels, constants, start)
     lines = _lines(channels, constants)
     image = _checked_frames(cameras, start, measured, m, cfg, lines, problems)
-    if missing := [m.actuator(i).name for i in range(m.nu) if m.actuator(i).name not in action]:
+    if nameless := nameless_actuators(m):
+        problems.append(RecordingError(nameless, where=mapping.source))
+    elif missing := [m.actuator(i).name for i in range(m.nu) if m.actuator(i).name not in (*action, *wrong)]:
         problems.append(
             RecordingError(
                 "commands are missing", where=mapping.source, expected="an [action.*] for every actuator of the scene",
@@ -109,7 +114,9 @@ def read_episode(
         )  # fmt: skip
     name = f"{PREFIX}{episode.number}"
     made = Demonstration(name, episode.task, episode.success, None, None, action, measured, image=image)
-    return ReadEpisode(made, start, lines, cameras, problems, _unused(episode, mapping, channels))
+    distinct = list({str(error): error for error in problems}.values())
+    behind = {one.label: one.behind for one in channels if one.behind}
+    return ReadEpisode(made, start, lines, cameras, distinct, _unused(episode, mapping, channels), behind)
 
 
 def _unused(episode: Episode, mapping: LogMap, channels: list[Numbers]) -> list[str]:
@@ -125,11 +132,12 @@ def _unused(episode: Episode, mapping: LogMap, channels: list[Numbers]) -> list[
 
 def _numbers(
     episode: Episode, mapping: LogMap, m: mujoco.MjModel, cfg: ImportCfg, problems: list[RecordingError]
-) -> tuple[list[Numbers], dict[str, float]]:
-    """Return the channels in SI and the constant commands; what is wrong is added to `problems`."""
+) -> tuple[list[Numbers], dict[str, float], list[str]]:
+    """Return the channels in SI, the constant commands, and names of channels with an error, added to `problems`."""
     actuators, sensors = targets_of(m)
     channels: list[Numbers] = []
     constants: dict[str, float] = {}
+    wrong: list[str] = []
     entries: list[tuple[NumberEntry, Target]] = []
     for kind, stated, known in (("action", mapping.action, actuators), ("measured", mapping.measured, sensors)):
         try:
@@ -146,13 +154,14 @@ def _numbers(
             one = converted(entry, target, episode, mapping, cfg.plausibility)
         except RecordingError as error:
             problems.append(error)
+            wrong += [target.name] if target.command else []
             continue
         if one is None:
             assert entry.constant is not None
             constants[target.name] = entry.constant
         else:
             channels.append(one)
-    return channels, constants
+    return channels, constants, wrong
 
 
 def _pose_channels(
@@ -215,8 +224,12 @@ def _lines(channels: list[Numbers], constants: Mapping[str, float]) -> list[Read
     """Return the lines of the table for numbers."""
     found = []
     for one in channels:
-        dropped = {"repeated stamps": one.repeated, "empty rows": one.empty}
-        remark = ", ".join(f"{count} {what} dropped" for what, count in dropped.items() if count)
+        done = {
+            "repeated stamps dropped": one.repeated,
+            "empty rows dropped": one.empty,
+            "misplaced stamps sorted": one.behind,
+        }
+        remark = ", ".join(f"{count} {what}" for what, count in done.items() if count)
         low, high = float(np.nanmin(one.value)), float(np.nanmax(one.value))
         unit = SI[one.target.quantity]
         found.append(

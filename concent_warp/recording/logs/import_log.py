@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from concent_warp.checks import check_settings
-from concent_warp.errors import RecordingError
+from concent_warp.errors import RecordingError, printable
 from concent_warp.limits import limits, raising
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.logs.bop.import_bop import BopImport, open_bop
@@ -21,6 +22,7 @@ from concent_warp.recording.logs.readers.calibration import FILE, Calibration, r
 from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Log
 from concent_warp.recording.logs.readers.open_log import open_log
+from concent_warp.recording.logs.scene_gaps import nothing_measured
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.unwind import unwound
@@ -141,6 +143,12 @@ def _mapped(
                 more = f"{len(others) + 1} things are wrong, which concent import --dry-run lists"
                 raise RecordingError(f"{str(first).rstrip('.')}; {more}")
             raise first
+        if episode.behind:
+            listed = ", ".join(f"{count} of {label}" for label, count in episode.behind.items())
+            name = episode.demonstration.name
+            warnings.warn(
+                printable(f"{name}: samples out of order were sorted by their stamps: {listed}"), stacklevel=3
+            )
         read.append(episode)
         if progress is not None:
             progress(0.3 * share)
@@ -199,6 +207,9 @@ def _episodes(log: Log, scene: Scene, mapping: LogMap, cfg: ImportCfg) -> Iterat
         raise RecordingError("the log has no episodes", where=log.source)
     for k, number in enumerate(dict.fromkeys(numbers)):
         read = read_episode(log.episode(number), mapping, scene.model, file, cfg)
+        if not (mapping.measured or mapping.body or mapping.image):
+            fix = nothing_measured(scene)
+            read.problems.append(RecordingError("the map names no measurement", where=mapping.source, fix=fix))
         if not read.problems:
             try:
                 validate(Recording(scene.xml, (read.demonstration,), str(log.source)))

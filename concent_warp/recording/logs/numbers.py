@@ -43,6 +43,8 @@ class Numbers:
     """Samples that were dropped since another one has their stamp."""
     empty: int = 0
     """Rows that were dropped since they are of other channels."""
+    behind: int = 0
+    """Samples that were behind a later one, and were put before it."""
 
     @property
     def label(self) -> str:
@@ -120,8 +122,8 @@ def converted(
             found=[signal.name for signal in signals],
         )  # fmt: skip
     raw = np.stack([signal.value for signal in signals], axis=1)
-    filled = np.isfinite(raw).any(axis=1) | (not first.sparse)
-    first, raw = replace(first, time=first.time[filled], value=first.value[filled]), raw[filled]
+    filled = np.asarray(np.isfinite(raw).any(axis=1) | (not first.sparse))
+    first, raw = first.only(filled), raw[filled]
     time, kept, repeated = clean_times(first, clocks[0], cfg)
     value = _in_si(raw[kept], entry, target, where)
     if target.command:
@@ -133,9 +135,8 @@ def converted(
     if len(signals) > 1 and len(entry.source) == 1:
         source = entry.source[0]
     delay = delay_of(first, clocks[0])
-    return Numbers(
-        target, source, where, time, value, entry.unit, entry.noise_std, delay, repeated, int((~filled).sum())
-    )
+    empty, behind = int((~filled).sum()), int((_behind(times_of(first, clocks[0])) > 0).sum())
+    return Numbers(target, source, where, time, value, entry.unit, entry.noise_std, delay, repeated, empty, behind)
 
 
 def times_of(stream: Signal | Images, clock: ClockEntry) -> np.ndarray:
@@ -176,12 +177,13 @@ def delay_of(stream: Signal | Images, clock: ClockEntry) -> float | None:
 def clean_times(stream: Signal | Images, clock: ClockEntry, cfg: PlausibilityCfg) -> tuple[np.ndarray, np.ndarray, int]:
     """Return increasing times [s], shape (n,), the rows that they are of, shape (n,) int, and how many were dropped.
 
-    Of samples with one stamp the last is kept.
+    Of samples with one stamp the last is kept. Samples that are a few periods out of order are sorted.
 
     Raises:
-        RecordingError: Too many stamps are repeated, or they are in another unit.
+        RecordingError: Too many stamps are repeated, they are in another unit, or the clock runs back.
     """
     time = times_of(stream, clock)
+    _check_order(time, stream, clock, cfg)
     rows = np.argsort(time, kind="stable")
     rows = rows[np.isfinite(time[rows])]
     ordered = time[rows]
@@ -193,6 +195,35 @@ def clean_times(stream: Signal | Images, clock: ClockEntry, cfg: PlausibilityCfg
             fix += f', or take the times of reception: [clock] "{stream.name}" = {{ use = "received" }}'
         raise RecordingError(f"{repeated} of {len(time)} stamps are repeated or missing", where=stream.name, fix=fix)
     return ordered[last], rows[last], repeated
+
+
+def _behind(time: np.ndarray) -> np.ndarray:
+    """Return how far each stamp is behind the latest one before it [s], shape (T,); 0 where there is none."""
+    known = np.where(np.isfinite(time), time, -np.inf)
+    with np.errstate(invalid="ignore"):
+        behind = np.maximum.accumulate(known) - time
+    return np.where(np.isfinite(behind), behind, 0.0)
+
+
+def _check_order(time: np.ndarray, stream: Signal | Images, clock: ClockEntry, cfg: PlausibilityCfg) -> None:
+    """Refuse stamps [s], shape (T,), of a clock that was set back or started anew: sorted, they would interleave."""
+    behind = _behind(time)
+    if not behind.any():
+        return
+    steps = np.diff(time[np.isfinite(time)])
+    period = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    late = np.flatnonzero(behind > cfg.max_back_step * period * (1 + 1e-6))
+    if not len(late):
+        return
+    row = int(late[0])
+    fix = "cut the log there into two, or sort its rows if only their order is wrong"
+    if stream.received is not None and clock.use != "received":
+        fix += f', or take the times of reception: [clock] "{stream.name}" = {{ use = "received" }}'
+    raise RecordingError(
+        f"time runs back by {behind[row]:.4g} s", where=stream.place(row),
+        expected=f"stamps that increase, but for up to {cfg.max_back_step:g} periods of {period:.3g} s",
+        found=f"{time[row]:.4f} s after {time[row] + behind[row]:.4f} s", fix=fix,
+    )  # fmt: skip
 
 
 def _sources(entry: NumberEntry, target: Target, episode: Episode, where: str) -> list[Signal]:

@@ -15,13 +15,14 @@ from concent_warp.recording.logs.import_log import Source, scene_of
 from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
+from concent_warp.recording.logs.scene_gaps import measured_gaps, nameless_actuators, unread_joints
 from concent_warp.recording.logs.suggest_vectors import VectorChoice, vector_choices
 from concent_warp.recording.logs.targets import Target, body_sensors, named_parts, targets_of
 from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
 from concent_warp.scene.scene import Scene
 
 WORDS = {
-    "position": ("pos", "position", "positions", "qpos", "angle", "state"),
+    "position": ("pos", "position", "positions", "qpos", "angle", "state", "enc", "encoder"),
     "velocity": ("vel", "velocity", "velocities", "qvel", "speed"),
     "effort": ("effort", "torque", "current", "load", "force"),
     "acceleration": ("acc", "accel", "acceleration", "accelerations"),
@@ -37,6 +38,8 @@ MAX_DEGREES = 720.0
 """Largest value that is guessed to be an angle in degrees [deg]."""
 
 
+GAP = "# scene: "
+"""Begins a line of a map that says what the scene lacks."""
 UNCALLED = "no name says command"
 """Why torques that are taken for commands of motors may be measured ones."""
 
@@ -63,7 +66,8 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
         RecordingError: The log cannot be read.
         SceneError: The scene cannot be read.
     """
-    m = scene_of(model).model
+    scene = scene_of(model)
+    m = scene.model
     parts = named_parts(m)
     first = log_sources(source, parts)[0]
     if first.exists() and log_kind(first) == "bop":
@@ -101,9 +105,19 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     lines += _images(found)
     if any(one.frames for one in found.signals.values()):
         lines += ["# [clock]  # the table has numbers of frames, and no times", '# "*" = { rate = ? }  # in Hz', ""]
-    if left := [name for name in found.signals if name not in used]:
+    left = [name for name in found.signals if name not in used]
+    gaps = [one for one in (nameless_actuators(m), *measured_gaps(scene, _sought(scene, found, left))) if one]
+    lines[1:1] = [f"{GAP}{one}" for one in gaps]
+    if left:
         lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _sought(scene: Scene, episode: Episode, left: Sequence[str]) -> list[str]:
+    """Return the joints without a sensor whose position channels that are not mapped may be, by their names."""
+    free = [{*words_of(n)} for n in left if not episode.signals[n].command and _quantity(n) == "position"]
+    joints = [(joint, {*_key(joint).split("_")} - {""}) for joint in unread_joints(scene)]
+    return [joint for joint, words in joints if words and any(words <= name for name in free)]
 
 
 def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:

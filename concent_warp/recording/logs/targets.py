@@ -68,8 +68,8 @@ class Target:
 
 def targets_of(m: mujoco.MjModel) -> tuple[dict[str, Target], dict[str, Target]]:
     """Return the named actuators and sensors of a scene, each by name."""
-    actuators = {m.actuator(i).name: _actuator(m, i) for i in range(m.nu) if m.actuator(i).name}
-    sensors = {m.sensor(i).name: _sensor(m, i) for i in range(m.nsensor) if m.sensor(i).name}
+    actuators = {m.actuator(i).name: actuator_target(m, i) for i in range(m.nu) if m.actuator(i).name}
+    sensors = {m.sensor(i).name: sensor_target(m, i) for i in range(m.nsensor) if m.sensor(i).name}
     return actuators, sensors
 
 
@@ -101,7 +101,7 @@ def body_sensors(m: mujoco.MjModel, body: str) -> tuple[str | None, str | None]:
     return found[0], found[1]
 
 
-def _actuator(m: mujoco.MjModel, row: int) -> Target:
+def actuator_target(m: mujoco.MjModel, row: int) -> Target:
     """Return an actuator."""
     name = m.actuator(row).name
     gain, bias = m.actuator_gainprm[row, 0], m.actuator_biasprm[row, 1]
@@ -158,7 +158,7 @@ def _tendon(m: mujoco.MjModel, tendon: int) -> tuple[bool | None, tuple[float, f
     return angular, (float(ends.min(axis=1).sum()), float(ends.max(axis=1).sum()))
 
 
-def _sensor(m: mujoco.MjModel, row: int) -> Target:
+def sensor_target(m: mujoco.MjModel, row: int) -> Target:
     """Return a sensor."""
     kind, target = int(m.sensor_type[row]), int(m.sensor_objid[row])
     name, size = m.sensor(row).name, int(m.sensor_dim[row])

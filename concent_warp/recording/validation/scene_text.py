@@ -10,6 +10,8 @@ from concent_warp.recording.validation.location import ErrorLocation
 
 FREE_TEXT = ("name", "class", "data")
 """Attributes that hold words, so that ``nan`` is not a number in them."""
+LONGEST_SHOWN = 80
+"""Characters of a text that is no scene which a message shows."""
 
 
 def check_scene_text(text: str, place: ErrorLocation) -> None:
@@ -27,6 +29,7 @@ def check_scene_text(text: str, place: ErrorLocation) -> None:
         )
     if not text.strip():
         raise place.error("the scene is empty", expected="MJCF text", fix="write the MJCF into the recording")
+    check_is_mjcf(text, place)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise place.error("the scene declares XML entities, which MJCF does not need", fix="remove the DOCTYPE")
     try:
@@ -38,6 +41,17 @@ def check_scene_text(text: str, place: ErrorLocation) -> None:
         element, copies = stack.pop()
         copies = _check_element(element, copies, place)
         stack.extend((child, copies) for child in element)
+
+
+def check_is_mjcf(text: str, place: ErrorLocation) -> None:
+    """Refuse a text without any element, such as the path of an MJCF file."""
+    if "<" not in text:
+        raise place.error(
+            "the scene is not XML",
+            expected="MJCF text",
+            found=repr(text[:LONGEST_SHOWN]),
+            fix="read a file with Scene.from_mjcf(path).xml",
+        )
 
 
 def _check_element(element: ElementTree.Element, copies: int, place: ErrorLocation) -> int:

@@ -62,6 +62,9 @@ def test_paths_are_read_in_the_order_given_and_episodes_are_counted_through(plac
         [action.grip]
         source = "action/grip.pos"
         unit = "percent"
+        [measured.elbow_position]
+        source = "observation.state/elbow.pos"
+        unit = "deg"
         """
     )
     found = cw.import_log([place / "two", place / "one"], **FILES)

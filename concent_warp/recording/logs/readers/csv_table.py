@@ -95,7 +95,7 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
     stamps = Stamps.of(header, f"{path}, line 1")
     if twice := sorted({name for name in header if header.count(name) > 1}):
         raise RecordingError("two columns of a table have the same name", where=f"{path}, line 1", found=twice)
-    columns = [_Column(name) for name in header]
+    columns, lines = [_Column(name) for name in header], array("q")
     for line, cells in rows:
         where = f"{path}, line {line}"
         if len(cells) != len(header):
@@ -104,16 +104,19 @@ def table_signals(path: Path, folder: str = "") -> dict[str, Signal]:
             stamps.append(cells)
         except ValueError as error:
             raise _not_a_number("a time", where, str(error)) from None
+        lines.append(line)
         for column, cell in zip(columns, cells, strict=True):
             column.append(line, cell.strip())
     if not len(stamps):
         raise RecordingError("a table has no rows below its header", where=path)
-    found, (times, used) = {}, stamps.times()
+    found, (times, used), numbers = {}, stamps.times(), np.array(lines)
     for k, column in enumerate(columns):
         if k not in used and (values := column.numbers(path)) is not None:
             name = folder + column.name
             command = COMMAND.search(name) is not None
-            found[name] = Signal(name, times, values, command=command, sparse=True, frames=stamps.frames)
+            found[name] = Signal(
+                name, times, values, command=command, sparse=True, frames=stamps.frames, lines=numbers, file=str(path)
+            )
     return found
 
 

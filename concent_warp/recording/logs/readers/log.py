@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -35,6 +35,22 @@ class Signal:
     without a value are then none."""
     frames: bool = False
     """Whether the stamps are numbers of frames."""
+    lines: np.ndarray | None = None
+    """Lines of the samples in their file, shape (T,) int, where it is a text."""
+    file: str = ""
+    """That file, for messages."""
+
+    def place(self, row: int) -> str:
+        """Return where a sample is, for messages: file and line, else the channel and its sample, counted from 0."""
+        if self.lines is None:
+            return f"{self.name}, sample {row}"
+        return f"{self.file}, line {self.lines[row]}"
+
+    def only(self, kept: np.ndarray) -> Signal:
+        """Return the signal with some of its samples, a mask of shape (T,)."""
+        lines = None if self.lines is None else self.lines[kept]
+        received = None if self.received is None else self.received[kept]
+        return replace(self, time=self.time[kept], value=self.value[kept], received=received, lines=lines)
 
 
 @dataclass(frozen=True)
@@ -56,6 +72,10 @@ class Images:
     """Times at which the logger received the frames [s], shape (T,), where these differ from the stamps."""
     frame: str = ""
     """Name of the camera's frame in the log's tree of transforms."""
+
+    def place(self, row: int) -> str:
+        """Return where a frame is, for messages."""
+        return f"{self.name}, frame {row}"
 
 
 @dataclass(frozen=True)
