@@ -15,6 +15,11 @@ from concent_warp.diagnosis.search.reconsider import Rival
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
+EXPLAINS_LESS = "another one explains more"
+"""Reason for which an effect is not accepted."""
+ALIKE = "the data cannot distinguish it from the accepted one"
+"""Reason for which another one of a group is not."""
+
 
 class Constants(NamedTuple):
     """Constants of the simulator that are other ones than as given; see `SearchRecord`."""
@@ -95,7 +100,7 @@ class SearchRecord:
         rest = [f for f in (updated.get(f.name, f) for f in findings) if f is not first]
         self.findings.append(first)
         self.findings += [
-            replace(f, accepted=False, reason=f.reason or "another one explains more")
+            replace(f, accepted=False, reason=f.reason or (ALIKE if f.name in updated else EXPLAINS_LESS))
             for f in sorted(rest, key=lambda f: -f.gain)
         ]
 

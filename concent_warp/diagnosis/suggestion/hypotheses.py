@@ -115,12 +115,11 @@ def open_question(model: Model, diagnosis: Diagnosis | Mapping[str, Any], cfg: S
         ((_width(p), k, i) for k, f in enumerate(accepted) for i, p in enumerate(f["parameters"])), default=None
     )
     if widest is None or widest[0] <= cfg.max_interval:
-        names = _listed([f["name"] for f in accepted])
-        return OpenQuestion(
-            {},
-            sentence=f"The data identify {names}, and all its parameters within {100 * cfg.max_interval:.0f} % "
-            "(--max-interval): there is nothing to suggest.".replace("its", "their" if len(accepted) > 1 else "its"),
-        )
+        names, whose = _listed([f["name"] for f in accepted]), "their" if len(accepted) > 1 else "its"
+        known = f"all {whose} parameters within {100 * cfg.max_interval:.0f} % (--max-interval)"
+        if remark := document.get("remark"):
+            return OpenQuestion({}, sentence=f"The model has {names}, and {known}. {remark}")
+        return OpenQuestion({}, sentence=f"The data identify {names}, and {known}: there is nothing to suggest.")
     width, k, i = widest
     found = _with(base, accepted)
     effect = len(base.effects) + k
@@ -187,7 +186,7 @@ def read_diagnosis(path: Path, model: Model) -> dict[str, Any]:
 
 def _of_model(better: Model, model: Model, path: Path) -> dict[str, Any]:
     """Return the JSON object of a diagnosis that led from a model to a better one."""
-    compiled, findings = better.compile(), []
+    compiled, findings = model.compile(), []
     known = [(a.effect.name, a.effect.target) for a in model.effects]
     for added in better.effects:
         if (added.effect.name, added.effect.target) in known or added.effect.nominal:
@@ -208,7 +207,12 @@ def _of_model(better: Model, model: Model, path: Path) -> dict[str, Any]:
             where=path,
             fix="give what --apply of diagnose wrote",
         )
-    return {"verdict": "effect", "effects": findings, "groups": [[f["name"]] for f in findings]}
+    return {
+        "verdict": "effect",
+        "effects": findings,
+        "groups": [[f["name"]] for f in findings],
+        "remark": f"{path} does not say what the data may confuse with that: give the folder of diagnose --out.",
+    }
 
 
 def _checked(document: Any, where: Path | None = None) -> tuple[str, list[dict[str, Any]], list[list[str]]]:

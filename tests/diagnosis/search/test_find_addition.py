@@ -117,7 +117,7 @@ def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
     ]
     assert [(f.name, f.accepted, f.reason, f.step) for f in made.record.findings] == [
         ("a", True, "", 1),
-        ("b", False, "another one explains more", 1),
+        ("b", False, "the data cannot distinguish it from the accepted one", 1),
         ("d", False, "another one explains more", 1),
         ("c", False, "another one explains more", 1),
     ]

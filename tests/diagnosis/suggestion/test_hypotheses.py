@@ -90,6 +90,13 @@ def test_saved_diagnoses_are_read(tmp_path):
     better.save(tmp_path / "better.toml")
     question = open_question(MODEL, read_diagnosis(tmp_path / "better.toml", MODEL), CFG)
     assert question.parameter == (0, 0, 0.1, 0.3)
+    known = MODEL.add(JointFriction("rail"), [0.4])
+    known = replace(known, effects=(replace(known.effects[0], intervals=((0.399, 0.401),)),))
+    known.save(tmp_path / "known.toml")
+    question = open_question(MODEL, read_diagnosis(tmp_path / "known.toml", MODEL), CFG)
+    assert not question.models
+    assert "data identify" not in question.sentence
+    assert "does not say what the data may confuse with that" in question.sentence
 
 
 @pytest.mark.parametrize(
