@@ -75,7 +75,7 @@ def write_report(
     data = page_data(shown_models, chosen, comparison, events, fit)
     data["forces"] = _forces(data, location)
     parts = {
-        "title": escape(_title(recording, fit)),
+        "title": escape(_title(recording, fit, diagnosis is not None)),
         "subtitle": escape(_subtitle(recording, comparison, fitted)),
         "verdict": escape(verdict(comparison, fitted, overlap, cfg)),
         "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap, cfg)),
@@ -207,10 +207,11 @@ def _views(name: str, comparison: Comparison, models: Mapping[str, Model]) -> st
     )
 
 
-def _title(recording: Recording, fit: FitResult | None) -> str:
+def _title(recording: Recording, fit: FitResult | None, diagnosed: bool) -> str:
     """Return the title of the page."""
     task = next((d.task for d in recording.demonstrations if d.task), "")
-    return ("Grounded simulation" if fit is not None else "Model against measurement") + (f": {task}" if task else "")
+    about = "Diagnosis" if diagnosed else "Model against measurement"
+    return ("Grounded simulation" if fit is not None else about) + (f": {task}" if task else "")
 
 
 def _subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str]) -> str:

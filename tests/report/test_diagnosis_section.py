@@ -148,5 +148,7 @@ def test_the_section_stands_in_the_report(case, tmp_path):
     found = compare_replays(models, case.recording, "mujoco")
     write_report(path, case.recording, found, diagnosis=NAMED)
     assert "The model lacks joint friction" in path.read_text()
+    assert "<title>Diagnosis" in path.read_text()
     write_report(path, case.recording, found)
     assert 'id="diagnosis"' not in path.read_text()
+    assert "<title>Model against measurement" in path.read_text()
