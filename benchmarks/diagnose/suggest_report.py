@@ -137,7 +137,7 @@ def _variant(rows: Sequence[Mapping[str, Any]], head: Sequence[str]) -> str:
 ## The menu first
 
 Since these figures a motion of the menu is taken without a search where it is expected to bring twice the evidence that
-is needed (`SuggestCfg.sufficient`): above, the menu was right in all seven data sets where one of the two was, in six
+is needed (`SuggestCfg.sufficient`): above, the menu was right in all seven data sets where only one of them was, in six
 of them because the second diagnosis of long throws did not end. Not all was measured again. First it was tried, at
 revision `07795a5c`, with weights asked for only where no motion of the menu without them is so, on the {len(rows)}
 groups of seeds 3 to 5, which nothing was chosen by (`python -m benchmarks.diagnose.suggest --names` with those of the

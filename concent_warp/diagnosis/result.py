@@ -171,11 +171,9 @@ class HoldingFriction:
             what = f"contact friction depends on the direction, by the simulator's default: with {values} it does not"
         else:
             what = f"dry friction in {self.where} creeps, by default constants of the simulator: with {values} it holds"
-        beside = f", {self.beside} fitted in both" if self.beside else ""
-        return (
-            f"The model's {what}, and the held-out error falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, "
-            f"{100 * self.high:.0f}]{beside}; the diagnosis uses it."
-        )
+        fall = f"{100 * self.gain:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]"
+        fall += f", {self.beside} fitted in both" if self.beside else ""
+        return f"The model's {what}, and the held-out error falls by {fall}; the diagnosis uses it."
 
     def to_json(self) -> dict[str, Any]:
         """Return it in plain types."""

@@ -92,7 +92,8 @@ def test_the_page_counts_what_was_measured(tmp_path, monkeypatch):
     assert "not begun | not begun | not begun" in text
     path = tmp_path / "rows.jsonl"
     path.write_text("".join(json.dumps(one) + "\n" for one in rows) + '{"name": "g", "fi')
-    assert sorted(one["name"] for one in read_rows(path)) == ["a", "b", "c", "d", "e", "f", "h", "i", "j"]
+    assert [one["name"] for one in read_rows(path)] == [one["name"] for one in rows]
+    assert {one["name"] for one in rows} == {"a", "b", "c", "d", "e", "f", "h", "i", "j"}
     monkeypatch.setattr(suggest_report, "DATA", tmp_path / "none.jsonl")
     with pytest.raises(SystemExit, match="nothing was measured"):
         suggest_report.write_report([], 84)

@@ -77,7 +77,7 @@ def run(arguments: Arguments) -> Recording | None:
         write_text(arguments.mapping, text)
         gaps = [line.removeprefix(GAP) for line in text.splitlines() if line.startswith(GAP)]
         for gap in gaps:
-            say(escape(f"the scene lacks something: {gap}"))
+            say(escape(f"to mend in the MJCF: {gap}"))
         guesses = text.count("# guess") + text.count("# no channel found") + len(gaps)
         say(f"{guesses} guesses or gaps are marked; check them, and all units and signs, with --dry-run")
         say_written(arguments.mapping)

@@ -41,7 +41,7 @@ def test_actuators_and_sensors_without_names_are_said_with_the_names_to_write(pl
         "2 sensors of the scene have no names by which the map could call them; "
         f'write {SHOULDER} <jointvel name="elbow_velocity" joint="elbow"/>',
     ):
-        assert f"the scene lacks something: {sentence}\n" in said
+        assert f"to mend in the MJCF: {sentence}\n" in said
         assert f"\n# scene: {sentence}\n" in text
     assert "\n3 guesses or gaps are marked" in said
     (place / "map.toml").write_text('[action]\nshoulder = "shoulder_cmd"\n')
@@ -55,7 +55,7 @@ def test_a_scene_without_sensors_is_said_with_those_to_add(place, capsys):
         f"the scene has no sensor that a measurement could be mapped to; add to its MJCF <sensor>{SHOULDER} {ELBOW}"
     )
     assert main([*COMMAND, "--suggest"]) == 0
-    assert f"the scene lacks something: {sentence}</sensor>\n1 guesses or gaps" in capsys.readouterr().out
+    assert f"to mend in the MJCF: {sentence}</sensor>\n1 guesses or gaps" in capsys.readouterr().out
     for option in (["--dry-run"], ["-o", "demo.h5"]):
         assert main([*COMMAND, *option]) == 2
         out, err = capsys.readouterr()
