@@ -54,7 +54,7 @@ def _row(effect: type[Effect], m: mujoco.MjModel) -> str:
 def _parameters(effect: type[Effect], m: mujoco.MjModel) -> str:
     """Return names and units; several parameters of one kind as one, with what they belong to in brackets."""
     units: dict[str, list[str]] = {}
-    for target in effect.targets(m):
+    for target in (*effect.targets(m), *effect.single_targets(m)):
         for parameter in effect(*target).parameters(m):
             found = units.setdefault(re.sub(r"\[.*\]", f"[{effect.kind}]", parameter.name), [])
             if parameter.unit not in found:
@@ -64,7 +64,7 @@ def _parameters(effect: type[Effect], m: mujoco.MjModel) -> str:
 
 def _unit(found: list[str]) -> str:
     """Return units in words, with what separates them from the name."""
-    words = " or ".join(found)
+    words = " or ".join("factor" if unit == "-" and len(found) > 1 else unit for unit in found)
     return "" if words == "-" else f" {words}"
 
 

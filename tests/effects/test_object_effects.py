@@ -54,6 +54,54 @@ def test_thrown_body_turns_about_its_shifted_centre_of_mass():
     )
 
 
+ARM = """<mujoco><option timestep="0.001"/><compiler angle="radian"/><worldbody>
+<body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.1"/>
+  <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.8"/>
+  <body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 0 1" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.4"/>{load}
+  </body></body></worldbody></mujoco>"""
+
+
+def test_a_load_in_a_point_is_a_small_heavy_body_there():
+    start = [0.3, -0.4]
+    load = '<geom type="sphere" size="1e-4" pos="0.25 0.03 -0.05" mass="0.3"/>'
+    carried = move(world(ARM.format(load=load)), 1.0, qpos=start)
+    plain = world(ARM.format(load=""))
+    added = move(plain.add(Mass("lower", "point"), [0.3, 0.25, 0.03, -0.05]), 1.0, qpos=start)
+    np.testing.assert_allclose(added.qpos, carried.qpos, atol=1e-6)
+    without = move(plain.add(Mass("lower", "point"), [0.0, 0.25, 0.03, -0.05]), 1.0, qpos=start)
+    np.testing.assert_array_equal(without.qpos, move(plain, 1.0, qpos=start).qpos)
+    assert np.abs(without.qpos - carried.qpos).max() > 0.1
+    weighed = world(ARM.format(load=load)).add(Mass("lower", "point"), [-0.3, 0.25, 0.03, -0.05])
+    np.testing.assert_allclose(move(weighed, 1.0, qpos=start).qpos, without.qpos, atol=1e-6)
+
+
+def test_what_a_mass_that_is_taken_away_leaves_may_be_a_body():
+    plain = world(ARM.format(load=""))
+    before = plain.compile()
+    after = plain.add(Mass("lower", "point"), [-0.15, 0.2, 0.1, 0.0]).compile()
+    body = before.body("lower").id
+    assert after.body_mass[body] == pytest.approx(0.25)
+    assert (after.body_inertia[body] > 0).all()
+
+
+def test_loads_in_a_point_are_those_of_links_that_turn():
+    m = world(ARM.format(load='<body name="tool"><geom size="0.01" mass="0.1"/></body>')).compile()
+    assert Mass.single_targets(m) == (("upper", "point"), ("lower", "point"))
+    own, usual = m.body("lower").mass[0], m.body("lower").mass[0]
+    mass, x, *_ = Mass("lower", "point").parameters(m)
+    assert (mass.null, mass.unit, mass.low, mass.high) == (0.0, "kg", -0.5 * own, 10 * usual)
+    assert x.null == pytest.approx(0.1)
+    assert x.high > 0.3
+    assert Mass.single_targets(world(CART).compile()) == ()
+    assert Mass.single_targets(world(BALL).compile()) == ()
+    with pytest.raises(ModelError, match="cannot act on these"):
+        world(BALL).add(Mass("thing", "point"))
+    assert Mass("lower", "point").has_as_special_case(Mass("lower"))
+    assert not Mass("lower").has_as_special_case(Mass("lower", "point"))
+    assert not Mass("lower", "point").has_as_special_case(Mass("upper"))
+
+
 @pytest.mark.parametrize("factor", [0.5, 3.0])
 def test_pendulum_of_another_inertia_swings_with_another_period(factor):
     swing = move(world(PENDULUM, Inertia("link"), factor), 2.0, qpos=[0.02]).qpos[:, 0]

@@ -6,10 +6,12 @@ from itertools import permutations
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.select import (
     element_name,
+    fingers,
     free_bodies,
     moving_as_one,
     outermost_links,
@@ -17,6 +19,12 @@ from concent_warp.effects.select import (
     unguided_body_targets,
 )
 
+POINT = "point"
+"""Second target of a mass that is in a point of the body."""
+LOAD_SHARE = 0.1
+"""Share of the mass of a robot of which a load is at least that its last link may carry unknown to the model [-]."""
+LEAST_MOMENT = 0.05
+"""Least moment of inertia of a body from which a mass was taken, over the least of the model's [-]."""
 EACH_AXIS = "axes"
 AXES = ("axis_x", "axis_y", "axis_z", EACH_AXIS)
 """Second targets of an inertia: the moment about one principal axis is off, or each is."""
@@ -44,27 +52,99 @@ class BodyEffect(Effect):
 
 
 class Mass(BodyEffect):
-    """A body heavier or lighter than the model's."""
+    """A body heavier or lighter than the model's.
+
+    The target is a body, or one on joints and `POINT`: it carries another mass, in a point.
+    """
 
     name = "mass"
-    summary = "Mass and inertia are the model's times a factor."
+    summary = (
+        "Mass and inertia are the model's times a factor. Or, by a second target, point: a link carries another mass"
+        " [kg] in one point of it, such as a tool or a load; its place is given in the body's frame."
+    )
     source = "rigid-body dynamics"
     signature = "residual force in proportion to acceleration and gravity; how far pushes and throws carry"
     confusions = ("actuator_gain", "sliding_friction", "armature", "grip_force")
+    requirement = "links that turn on joints, where the other mass is in a point"
+    parts = (POINT,)
 
-    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return one factor."""
-        return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3, scan=(0.7, 1.4)),)
+    def has_as_special_case(self, other: Effect) -> bool:
+        """Return whether another mass of the same body is the model's times a factor, where this one is in a point."""
+        return bool(self.part) and isinstance(other, Mass) and not other.part and other.elements == self.elements
+
+    @classmethod
+    def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the links that turn, but for fingers, each with `POINT`."""
+        left_out, found = fingers(m), dict[int, str]()
+        for b in range(1, m.nbody):
+            link, name = int(m.body_weldid[b]), element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)
+            if name and link not in left_out and m.body_mass[b] > 0 and _is_turning_link(m, b):
+                found.setdefault(link, name)
+        return tuple((name, POINT) for name in found.values())
+
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether a body turns on joints, where the other mass is in a point."""
+        return not self.part or _is_turning_link(m, i)
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let the compiled body have a centre of mass off its origin, where the other mass is in a point."""
+        for n in self.elements if self.part else ():
+            spec.body(n).simple = False
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Return one factor, or the mass of the point and its place, the centre of mass where it has none."""
+        if not self.part:
+            return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3, scan=(0.7, 1.4)),)
+        body = self.ids(m)[0]
+        own, size = float(m.body_mass[body]), _size(m, body)
+        usual = max(own, LOAD_SHARE * float(m.body_subtreemass[m.body_rootid[body]]))
+        places = zip("xyz", m.body_ipos[body], strict=True)
+        return (
+            Parameter("mass", "kg", 0.0, -0.5 * own, 10 * usual, 0.3 * usual, scan=(-0.3 * own, 0.3 * usual, usual)),
+            *(Parameter(axis, "m", float(c), float(c) - 6 * size, float(c) + 6 * size, size) for axis, c in places),
+        )
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
-        """Mass and inertia, and the share of the weight that is compensated."""
-        return mass_fields(m, self.ids(m))
+        """Mass and inertia, and the share of the weight that is compensated; the principal axes for a point."""
+        return (*mass_fields(m, self.ids(m)), *(("body_ipos", "body_iquat") if self.part else ()))
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Scale both; a drive goes on compensating the weight that it knows."""
+        """Scale both, or add the point; a drive goes on compensating the weight that it knows."""
+        if self.part:
+            _add_point(m, self.ids(m)[0], float(values[0]), values[1:])
+            return
         m.body_mass[self.ids(m)] *= values[0]
         m.body_inertia[self.ids(m)] *= values[0]
         m.body_gravcomp[self.ids(m)] /= values[0]
+
+
+def _is_turning_link(m: mujoco.MjModel, body: int) -> bool:
+    """Return whether a body turns on joints, and does not move freely."""
+    first = m.body_jntadr[m.body_weldid[body]]
+    free = first < 0 or m.jnt_type[first] == int(mujoco.mjtJoint.mjJNT_FREE)
+    return not free and turning_axes(m, body) > 0
+
+
+def _add_point(m: mujoco.MjModel, body: int, mass: float, place: np.ndarray) -> None:
+    """Give a body of a compiled model another mass [kg] in a point of its frame [m], shape (3,).
+
+    A mass that is taken away leaves an inertia that a body may have.
+    """
+    own, centre = float(m.body_mass[body]), m.body_ipos[body].copy()
+    if mass == 0.0:
+        return
+    arm, total = place - centre, own + mass
+    turn = Rotation.from_quat(m.body_iquat[body], scalar_first=True).as_matrix()
+    inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
+    # Of two masses about the centre of both: their reduced mass at their distance.
+    inertia += own * mass / total * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    moments, axes = np.linalg.eigh(inertia)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    m.body_mass[body], m.body_ipos[body] = total, centre + mass / total * arm
+    m.body_inertia[body] = np.maximum(moments, LEAST_MOMENT * m.body_inertia[body].min())
+    m.body_iquat[body] = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    m.body_gravcomp[body] *= own / total
 
 
 def mass_fields(m: mujoco.MjModel, bodies: np.ndarray) -> tuple[str, ...]:
@@ -88,9 +168,7 @@ class CenterOfMass(BodyEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return an offset along each axis of the body."""
-        body = self.ids(m)[0]
-        extent = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
-        size = max(extent, LEVER_SHARE * _lever(m, body))
+        size = _size(m, self.ids(m)[0])
         return tuple(Parameter(axis, "m", 0.0, -3 * size, 3 * size, 0.3 * size) for axis in "xyz")
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -100,6 +178,12 @@ class CenterOfMass(BodyEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Shift it."""
         m.body_ipos[self.ids(m)] += values
+
+
+def _size(m: mujoco.MjModel, body: int) -> float:
+    """Return the size of a body [m]: its radius of gyration, or a share of its distance from its hinges."""
+    extent = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
+    return max(extent, LEVER_SHARE * _lever(m, body))
 
 
 def _lever(m: mujoco.MjModel, body: int) -> float:
