@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -175,3 +176,9 @@ def sample_values_and_rates(
     error = np.einsum("tij,ntjd->ntid", root, rng.standard_normal((count, *both.shape)))
     both = np.concatenate([both[None], both + error])
     return both[:, :, 0], both[:, :, 1]
+
+
+def worst_scatter(scatter: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the largest scatter of some signals at T times, each over its median, shape (T,)."""
+    each = np.array(scatter)
+    return (each / np.maximum(np.median(each, axis=1, keepdims=True), 1e-12)).max(axis=0)

@@ -24,7 +24,14 @@ from concent_warp.estimation.joint_signals import (
     joint_signals,
 )
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
-from concent_warp.estimation.signals import MeasuredBall, MeasuredBody, MeasuredJoint, OrientationSignal, Signal
+from concent_warp.estimation.signals import (
+    MeasuredBall,
+    MeasuredBody,
+    MeasuredJoint,
+    OrientationSignal,
+    Signal,
+    worst_scatter,
+)
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.simulate.replay import acting_commands, initial_state, interpolate, replay, step_count
 
@@ -234,19 +241,19 @@ class StateEstimator:
             qpos[:, :, place : place + 4], qvel[:, :, dof : dof + 3] = orientation.sample(time, count, rng)
         return qpos, qvel
 
-    def scatter(self, time: np.ndarray, *, both_sides: bool = False) -> np.ndarray:
+    def scatter(self, time: np.ndarray) -> np.ndarray:
         """Return the scatter of the readings around each of `time` (T,), over the median, of the worst signal, (T,).
 
         Large where an impact lies among the readings.
-
-        Args:
-            time: Shape (T,) [s].
-            both_sides: Whether readings on both sides of each time count also where those on one side, which may be
-                smooth up to an impact, are what an estimate is taken from.
         """
-        signals = self.signals()
-        scatter = np.array([s.scatter_of_both_sides(time) if both_sides else s.scatter(time) for s in signals])
-        return (scatter / np.maximum(np.median(scatter, axis=1, keepdims=True), 1e-12)).max(axis=0)
+        return worst_scatter([s.scatter(time) for s in self.signals()])
+
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the same of readings on both sides of each time, shape (T,).
+
+        An estimate is taken from those on one side, which may be smooth up to an impact.
+        """
+        return worst_scatter([s.scatter_of_both_sides(time) for s in self.signals()])
 
     def in_contact(self, bodies: Sequence[str], time: np.ndarray) -> np.ndarray:
         """Return when any of some free bodies was in contact, by its measured acceleration, shape (T,) bool.

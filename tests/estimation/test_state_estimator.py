@@ -122,7 +122,7 @@ def test_an_impact_shows_in_the_scatter_also_where_the_readings_on_one_side_are_
     demonstration.measured["position"].value[:] += 2.0 * np.maximum(time - 1.0, 0.0)[:, None]
     near = np.array([0.995, 1.0, 1.005, 1.015])
     measured, times = StateEstimator.of(Model(Scene(SCENE)), demonstration), np.linspace(0.2, 0.9, 40)
-    scatter = measured.scatter(np.concatenate([near, times]), both_sides=True)
+    scatter = measured.scatter_of_both_sides(np.concatenate([near, times]))
     assert scatter[: len(near)].min() > max(3.0, scatter[len(near) :].max())
 
 

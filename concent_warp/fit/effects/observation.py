@@ -18,14 +18,14 @@ import numpy as np
 
 from concent_warp.checks import Bounds, Count, Positive, PositiveDuration, Share
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.partial_state import PartialState, partial_state, told_joints
+from concent_warp.estimation.partial_state import PartialState, PartialStateEstimator
 from concent_warp.estimation.sample_noise import covariance_std, relative_whitening, whitened
 from concent_warp.estimation.state_estimator import StateEstimator
+from concent_warp.fit.effects.guided_replay import GuidedReplay
 from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.joint_signals import CoupledJoints
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
 
@@ -409,8 +409,10 @@ class ObservedRecording:
     """Settings."""
     _measured: dict[int, tuple[Demonstration, StateEstimator | None]] = field(default_factory=dict, repr=False)
     """Estimated motions so far, by the identity of the demonstration."""
-    _told: dict[int, tuple[Demonstration, tuple[CoupledJoints, np.ndarray]]] = field(default_factory=dict, repr=False)
-    """Joints that were measured so far, where others were not, likewise."""
+    _partial: dict[int, tuple[Demonstration, PartialStateEstimator]] = field(default_factory=dict, repr=False)
+    """What was measured of motions of which not all was, likewise."""
+    _guided: dict[int, tuple[Demonstration, GuidedReplay | None]] = field(default_factory=dict, repr=False)
+    """Replays that follow what was measured of these, likewise."""
 
     def state(self, d: Demonstration, time: float) -> PartialState:
         """Return the state of a demonstration at a time [s], as recorded or measured, else of the reference pose."""
@@ -421,12 +423,37 @@ class ObservedRecording:
         if (estimator := self.measured(d)) is not None:
             states = estimator.states(np.array([time]))
             return PartialState(states.qpos[0], states.qvel[0], every)
-        if id(d) not in self._told:
-            self._told[id(d)] = (d, told_joints(m, d))
-        found = partial_state(m, d, time, joints=self._told[id(d)][1])
+        if time > 0.0 and (guided := self.guided(d)) is not None:
+            return guided.state(time)
+        found = self._partly_measured(d).state(time)
         if time <= 0.0 and d.qpos is not None:
             return replace(found, qpos=initial_state(m, d)[0])
         return found
+
+    def guided(self, d: Demonstration) -> GuidedReplay | None:
+        """Return replays of a demonstration that follow the measured part of its motion.
+
+        None where all of it was measured, or nothing of a body that moves freely: where that goes, a model without the
+        missing effect does not know.
+        """
+        if id(d) not in self._guided:
+            found = None
+            if self.measured(d) is None and _sees_each_free_body(self.model.scene.model, self._partly_measured(d)):
+                partial = self._partly_measured(d)
+                found = GuidedReplay.of(self.model, d, partial, self._spread(d, partial.measured))
+            self._guided[id(d)] = (d, found)
+        return self._guided[id(d)][1]
+
+    def _partly_measured(self, d: Demonstration) -> PartialStateEstimator:
+        """Return the states of a demonstration as far as they were measured."""
+        if id(d) not in self._partial:
+            self._partial[id(d)] = (d, PartialStateEstimator.of(self.model.scene.model, d))
+        return self._partial[id(d)][1]
+
+    def _spread(self, d: Demonstration, measured: np.ndarray | None) -> np.ndarray:
+        """Return the standard deviation of the first state of a demonstration, see `start_spread`."""
+        noise = {name: std for name, std in self.noise.items() if name in d.measured}
+        return start_spread(self.model.scene.model, noise, self.cfg, measured=measured)
 
     def measured(self, d: Demonstration) -> StateEstimator | None:
         """Return the estimated motion of a demonstration, None where the pose of a body or joint was not measured."""
@@ -475,6 +502,8 @@ class ObservedRecording:
             return None
         state, noise = self.state(d, start), {r.channel: r.std for r in readings}
         spread = start_spread(m, noise, self.cfg, measured=None if state.measured.all() else state.measured)
+        if start > 0.0 and not state.measured.all() and (guided := self.guided(d)) is not None:
+            spread = self._guided_spread(guided, start, spread)
         clocks = np.concatenate(clock)
         found = Window(d, number, start, end, state.qpos, state.qvel, spread, tuple(readings), count, clocks)
         if not shared:
@@ -485,11 +514,33 @@ class ObservedRecording:
             column += part.shape[1]
         return replace(found, common=common, scatter=NumericalScatter(common))
 
+    def _guided_spread(self, guided: GuidedReplay, start: float, spread: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of a state of which replays tell what was not measured, shape (2 nv,).
+
+        Of that it is the replays', at least that of coordinates that no sensor measures and at most that of ones that
+        nothing tells.
+
+        Args:
+            guided: The replays.
+            start: When [s].
+            spread: Standard deviation where nothing but the readings tells the state, shape (2 nv,).
+        """
+        nv = len(spread) // 2
+        least = self.cfg.state_noise * np.repeat([self.cfg.unmeasured_position, self.cfg.unmeasured_velocity], nv)
+        told = np.clip(guided.deviation_at(start), np.minimum(least, spread), spread)
+        return np.where(np.tile(guided.partial.measured, 2), spread, told)
+
     def _stated(self, name: str) -> float:
         """Return the noise of a channel with covariances as the recording states it, that of all demonstrations."""
         channels = [d.measured[name] for d in self.recording.demonstrations if name in d.measured]
         stated = [std for c in channels if (std := c.noise_std or covariance_std(c))]
         return float(np.sqrt(np.mean(np.square(stated)))) if stated else self.noise[name]
+
+
+def _sees_each_free_body(m: mujoco.MjModel, partial: PartialStateEstimator) -> bool:
+    """Return whether something of the position of each body that moves freely was measured, of one at least."""
+    first = m.jnt_dofadr[m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
+    return len(first) > 0 and all(partial.measured[dof : dof + 3].any() for dof in first)
 
 
 def first_time(d: Demonstration, channels: Sequence[str]) -> float:

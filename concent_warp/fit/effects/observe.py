@@ -12,7 +12,6 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import pooled_noise
 from concent_warp.estimation.sensors import kind_and_unit
-from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.fit.effects.observation import (
     ObservationCfg,
     ObservedRecording,
@@ -27,6 +26,8 @@ from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
+    from concent_warp.estimation.partial_state import PartialStateEstimator
+    from concent_warp.estimation.state_estimator import StateEstimator
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
 
@@ -115,12 +116,15 @@ def observe(
     cfg = cfg or ObservationCfg()
     source = ObservedRecording(model, recording, noise or channel_noises(model, recording, cfg), cfg)
     windows: list[Window] = []
-    longest = cfg.max_contact_length if has_touchable_free_body(model.compile()) else cfg.max_length
+    rough = has_touchable_free_body(model.compile())
+    longest = cfg.max_contact_length if rough else cfg.max_length
     for number, d in enumerate(recording.demonstrations):
         channels = [c for c in source.noise if c in d.measured]
         last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
         start = 0.0 if d.qpos is not None or d.action else first_time(d, channels)
-        measured = source.measured(d)
+        measured: StateEstimator | PartialStateEstimator | None = source.measured(d)
+        if measured is None and rough and (guided := source.guided(d)) is not None:
+            measured = guided.partial
         while start < last - 1e-6:
             end = last
             if measured is not None:
@@ -247,9 +251,11 @@ def _rms(value: np.ndarray) -> np.ndarray:
     return np.sqrt((value**2).mean(axis=-1))
 
 
-def _calmest(measured: StateEstimator, start: float, reach: float, cfg: ObservationCfg) -> float:
+def _calmest(
+    measured: StateEstimator | PartialStateEstimator, start: float, reach: float, cfg: ObservationCfg
+) -> float:
     """Return the time at which a window ends [s]: late, and not in an impact, where velocities are unknown."""
     times = start + np.linspace(reach, 0.35 * reach, 27)
-    rough = measured.scatter(times, both_sides=True)
+    rough = measured.scatter_of_both_sides(times)
     calm = np.flatnonzero(rough < cfg.max_scatter)
     return float(times[calm[0] if len(calm) else rough.argmin()])

@@ -167,7 +167,7 @@ class Rough:
     def __init__(self, rough: Any) -> None:
         self._rough = rough
 
-    def scatter(self, times: np.ndarray, *, both_sides: bool) -> np.ndarray:  # noqa: ARG002
+    def scatter_of_both_sides(self, times: np.ndarray) -> np.ndarray:
         return self._rough(times)
 
 

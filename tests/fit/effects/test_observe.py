@@ -178,8 +178,7 @@ def test_motion_from_the_top_keeps_close_to_its_start_for_a_shorter_time():
 
 def test_a_window_ends_late_but_before_an_impact():
     class Rough:
-        def scatter(self, times, *, both_sides):
-            assert both_sides
+        def scatter_of_both_sides(self, times):
             return np.where(times > 0.8, 10.0, 1.0)
 
     found = _calmest(Rough(), 0.0, 1.0, ObservationCfg())  # pyright: ignore[reportArgumentType]
