@@ -12,14 +12,8 @@ import numpy as np
 from concent_warp.checks import Positive, PositiveDuration
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch
-from concent_warp.fit.effects.observation import (
-    NumericalScatter,
-    ObservationCfg,
-    ObservedRecording,
-    Window,
-    first_part,
-    first_time,
-)
+from concent_warp.fit.effects.observation import NumericalScatter, ObservedRecording, Window, first_part, first_time
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import huber, huber_limit

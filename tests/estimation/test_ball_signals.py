@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import partial_state
 from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
-from concent_warp.fit.effects.observation import ObservationCfg, start_spread
+from concent_warp.fit.effects.observation import start_spread
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene

@@ -8,8 +8,9 @@ import pytest
 
 from concent_warp.comparison.initial_states import with_initial_states
 from concent_warp.estimation.partial_state import partial_state
-from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, start_spread
-from concent_warp.fit.effects.observe import observe
+from concent_warp.fit.effects.observation import ObservedRecording, start_spread
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
+from concent_warp.fit.effects.observe import _calmest, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -86,13 +87,23 @@ def test_a_motion_of_which_nothing_tells_where_a_body_is_stays_whole(pushed):
     assert len(observe(Model(Scene(PUSHED)), Recording(PUSHED, (blind,)))) == 1
 
 
+def test_a_window_lasts_until_replays_tell_what_was_not_measured(pushed):
+    recording, *_ = pushed
+    source = ObservedRecording(Model(Scene(PUSHED)), recording, {"x": 2e-4, "place": 2e-4, "turned": 2e-4})
+    guided, cfg = source.guided(recording[0]), ObservationCfg()
+    assert guided is not None
+    late = replace(guided, known=guided.time > 1.2)
+    assert 1.2 < _calmest(late, 0.0, 0.3, cfg) < 1.5
+    assert 1.2 < _calmest(late, 1.0, 0.5, cfg) <= 1.5
+    assert _calmest(replace(guided, known=guided.time < 0.0), 0.0, 0.3, cfg) == np.inf
+
+
 def test_replays_that_are_set_to_readings_forget_an_unknown_start(pushed):
     recording, _, qpos, _ = pushed
     source = ObservedRecording(Model(Scene(PUSHED)), recording, {"x": 2e-4, "place": 2e-4, "turned": 2e-4})
     guided = source.guided(recording[0])
     assert guided is not None
-    assert guided.deviation[0, 3] > 0.01
-    assert guided.deviation_at(1.5)[3] < 1e-3
+    assert guided.is_known(np.array([0.0, 0.05, 1.5, 2.0])).tolist() == [False, False, True, True]
     state = guided.state(1.5)
     assert state.measured.tolist() == [True, True, True, False, True, True, True]
     assert state.qpos[3] == pytest.approx(qpos[75, 3], abs=2e-4)

@@ -13,7 +13,8 @@ from concent_warp.estimation.object_tracks import frame_channel
 from concent_warp.estimation.partial_state import partial_state
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.estimation.state_estimator import StateEstimator
-from concent_warp.fit.effects.observation import ObservationCfg, start_spread
+from concent_warp.fit.effects.observation import start_spread
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.report.motion_data import _measured_poses
 from concent_warp.scene.scene import Scene

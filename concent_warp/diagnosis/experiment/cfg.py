@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from concent_warp.checks import Bounds, Count, Duration, Positive, PositiveDuration, Rate, Share
-from concent_warp.fit.effects.observation import ObservationCfg
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ import numpy as np
 from concent_warp.diagnosis.experiment.cfg import MotionMenuCfg
 from concent_warp.effects.select import POSES, free_bodies
 from concent_warp.errors import RecordingError
-from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording
+from concent_warp.fit.effects.observation import ObservedRecording
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.payloads import Payload
 from concent_warp.simulate.replay import commands, initial_state

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from concent_warp.fit.effects.cross_validation import BlockCfg
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg
-from concent_warp.fit.effects.observation import ObservationCfg
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.prediction import PredictionCfg
 
 

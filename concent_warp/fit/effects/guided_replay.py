@@ -42,8 +42,8 @@ class GuidedReplay:
     """States of the replay from the first state, shape (R, nq)."""
     qvel: np.ndarray
     """Shape (R, nv)."""
-    deviation: np.ndarray
-    """Standard deviation of the replays from other initial states, of positions and velocities, shape (R, 2 nv)."""
+    known: np.ndarray
+    """Whether the replays from other initial states agree in what was not measured, shape (R,) bool."""
 
     @staticmethod
     def of(
@@ -51,6 +51,7 @@ class GuidedReplay:
         d: Demonstration,
         partial: PartialStateEstimator,
         spread: np.ndarray,
+        agreement: np.ndarray,
         *,
         seed: int = 0,
     ) -> GuidedReplay | None:
@@ -61,6 +62,7 @@ class GuidedReplay:
             d: What was commanded and measured.
             partial: The states, as far as they were measured.
             spread: Standard deviation of the first state, positions and then velocities, shape (2 nv,).
+            agreement: Standard deviation of states that counts as agreement, likewise.
             seed: Seed of the other initial states.
         """
         m = model.compile()
@@ -96,7 +98,7 @@ class GuidedReplay:
             time,
             np.array([qpos[0] for qpos, _ in course]),
             np.array([qvel[0] for _, qvel in course]),
-            np.array([_deviation(m, qpos, qvel) for qpos, qvel in course]),
+            np.array([(_deviation(m, *states) <= agreement)[~np.tile(partial.measured, 2)].all() for states in course]),
         )
 
     def state(self, time: float) -> PartialState:
@@ -109,9 +111,14 @@ class GuidedReplay:
         qpos[places], qvel[rates] = seen[0, places], moved[0, rates]
         return PartialState(qpos, qvel, self.partial.measured)
 
-    def deviation_at(self, time: float) -> np.ndarray:
-        """Return the standard deviation of the replays at a time [s], of positions and velocities, shape (2 nv,)."""
-        return interpolate(self.time, self.deviation, np.array([time]))[0]
+    def is_known(self, time: np.ndarray) -> np.ndarray:
+        """Return whether the replays tell what was not measured at `time` (T,) [s], shape (T,) bool."""
+        row = np.clip(np.searchsorted(self.time, time), 0, len(self.time) - 1)
+        return self.known[row] & self.known[np.maximum(row - 1, 0)]
+
+    def scatter_of_both_sides(self, time: np.ndarray) -> np.ndarray:
+        """Return the scatter of the readings on both sides of each of `time` (T,), see `worst_scatter`, shape (T,)."""
+        return self.partial.scatter_of_both_sides(time)
 
 
 def _measured_coordinates(partial: PartialStateEstimator) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from concent_warp.fit.effects.observation import ObservationCfg, Window
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.prediction import Course, Prediction, Reader, SimulationRequest
 
 

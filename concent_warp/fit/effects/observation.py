@@ -11,17 +11,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from concent_warp.checks import Bounds, Count, Positive, PositiveDuration, Share
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState, PartialStateEstimator
 from concent_warp.estimation.sample_noise import covariance_std, relative_whitening, whitened
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.fit.effects.guided_replay import GuidedReplay
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.scene.sensor_frame import SensorFrame, sensor_frame
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
@@ -32,95 +32,6 @@ if TYPE_CHECKING:
 
 MIN_LEVER = 3e-3
 """Motion of a marker [m or rad] for one of a joint below which it says nothing of the joint."""
-
-
-@dataclass(frozen=True)
-class ObservationCfg:
-    """How recordings are cut into windows, and how uncertain the initial states of these are.
-
-    "Empirical" values were set on the scenes of the hidden-effect benchmark.
-    """
-
-    velocity_time: PositiveDuration = 0.03
-    """Time over which the noise of a position makes a velocity at the start of a window uncertain [s]: about the time
-    over which a velocity is estimated."""
-    state_noise: Positive = 3.0
-    """Uncertainty of a measured state at the start of a window, in standard deviations of the measurement noise [-]:
-    3 sigma."""
-    unmeasured_position: Positive = 1e-3
-    """Uncertainty of a position that no sensor measures [m or rad]. Empirical."""
-    unmeasured_velocity: Positive = 1e-2
-    """Uncertainty of a velocity that no sensor measures [m/s or rad/s]. Empirical."""
-    unknown_position: Positive = 0.1
-    """Uncertainty of a coordinate that was not measured of a free body of which others were [m]. Empirical."""
-    unknown_velocity: Positive = 0.5
-    """Uncertainty of its velocity [m/s]. Empirical."""
-    unknown_orientation: Positive = 0.3
-    """Uncertainty of an orientation that was not measured of a body whose position was [rad]. Empirical."""
-    unknown_spin: Positive = 3.0
-    """Uncertainty of its angular velocity [rad/s]. Empirical."""
-    min_values: Count = 12
-    """Least measured values of a recording that can be compared with a model [-]: one for each block of time."""
-    probe_pairs: Count = 6
-    """Pairs of simulations from opposite errors of the initial state, from which the length of windows is chosen [-].
-    Empirical."""
-    max_curvature: Positive = 3.0
-    """Deviation of the mean of such a pair from the simulation without an error, over the noise and the numerical
-    scatter, at which a window ends [-]: beyond it, the effect of an error is no longer in proportion to it.
-    Empirical."""
-    max_transient: Annotated[float, Bounds(0)] = 0.1
-    """Longest time of such deviations that a window goes on after, once [s]: of the rebound of a body on joints without
-    drives, which one start has earlier than its opposite, and after which the effect is in proportion again. The body
-    of a free joint leaves it with another spin; drives press bodies together again. Empirical."""
-    max_scatter_noise: Positive = 5.0
-    """Largest numerical scatter that is taken into account there, over the noise [-]: chaotic motion scatters without
-    limit. Empirical."""
-    max_scatter: float = 2.0
-    """Scatter of the samples about a smooth motion over its median below which a window may start [-]: it is larger at
-    impacts, where velocities are unknown. Empirical."""
-    min_length: PositiveDuration = 0.12
-    """Shortest window [s]. Empirical."""
-    max_length: PositiveDuration = 20.0
-    """Longest window [s], for the simulations' memory."""
-    max_contact_length: PositiveDuration = 2.0
-    """Longest window of a body that moves freely and can be touched [s]: contacts that are made and broken give a long
-    window's cost many local minima, in which errors of its initial state stand in for a wrong friction or mass
-    (multiple shooting: Bock 1983). Long enough for a fall of a metre."""
-    scatter_samples: Annotated[int, Bounds(0, 10_000, excluded=1)] = 16
-    """Simulations from which the numerical scatter of a window's predictions is estimated [-], see `NumericalScatter`;
-    0 for none."""
-    scatter_offset: Positive = 0.02
-    """Standard deviation of the differences of their initial states, in units of the states' spread [-]: small beside
-    what is fitted, large enough to shift the instant of each later impact within a time step."""
-    chatter: Annotated[float, Bounds(0)] = 5.0
-    """Standard deviation that a residual is allowed for what changes without order from reading to reading in these
-    simulations, over its own there [-], see `NumericalScatter`; 0 for none. So large that hardly anything is left of
-    it: a model is no better for hopping less than another."""
-    min_scatter: Positive = 0.1
-    """Standard deviation along a direction of the residuals below which scatter is neglected [-]: a hundredth of the
-    noise's variance."""
-    impact_error: Share = 0.0
-    """Standard deviation of each component of the velocity after an impact that no contact law foretells, over the
-    change of the velocity [-], see `impact_deviations`; 0 for none."""
-    impact_duration_error: Annotated[float, Bounds(0)] = 1.0
-    """Standard deviation of the time for which bodies touch in an impact after which they fly, over that in the
-    simulation [-]: a rigid contact is one of them away; nothing where `impact_error` is 0."""
-    impact_flight: PositiveDuration = 0.02
-    """Time that a body has flown before an impact [s]; shorter hops are the chatter of a contact."""
-    impact_duration: PositiveDuration = 0.02
-    """Time after which an impact is over where the body stays in contact [s]: several time constants of a contact."""
-    impact_acceleration: Positive = 0.5
-    """Acceleration beside gravity, in units of it, above which a body touches something [-]."""
-    impact_velocity: Positive = 0.05
-    """Change of the velocity from which a contact counts as an impact [m/s]."""
-    default_position_noise: Positive = 1e-3
-    """Noise of positions for which it is neither stated nor estimable [m or rad]: of a typical motion capture."""
-    default_noise: Positive = 1e-2
-    """The same for all other channels [their unit]."""
-
-    def noise_of_unit(self, unit: str) -> float:
-        """Return the noise of a channel for which it is neither stated nor estimable, in its unit."""
-        return self.default_position_noise if unit in ("m", "rad") else self.default_noise
 
 
 @dataclass(frozen=True)
@@ -433,14 +344,15 @@ class ObservedRecording:
     def guided(self, d: Demonstration) -> GuidedReplay | None:
         """Return replays of a demonstration that follow the measured part of its motion.
 
-        None where all of it was measured, or nothing of a body that moves freely: where that goes, a model without the
-        missing effect does not know.
+        None where all of it was measured, or neither place nor orientation of a body that moves freely: where that
+        goes, a model without the missing effect does not know.
         """
         if id(d) not in self._guided:
-            found = None
-            if self.measured(d) is None and _sees_each_free_body(self.model.scene.model, self._partly_measured(d)):
+            found, m = None, self.model.scene.model
+            if self.measured(d) is None and _sees_each_free_body(m, self._partly_measured(d)):
                 partial = self._partly_measured(d)
-                found = GuidedReplay.of(self.model, d, partial, self._spread(d, partial.measured))
+                spread = self._spread(d, partial.measured)
+                found = GuidedReplay.of(self.model, d, partial, spread, self._known(m.nv))
             self._guided[id(d)] = (d, found)
         return self._guided[id(d)][1]
 
@@ -449,6 +361,10 @@ class ObservedRecording:
         if id(d) not in self._partial:
             self._partial[id(d)] = (d, PartialStateEstimator.of(self.model.scene.model, d))
         return self._partial[id(d)][1]
+
+    def _known(self, nv: int) -> np.ndarray:
+        """Return the standard deviation of a state that replays tell, positions and then velocities, shape (2 nv,)."""
+        return self.cfg.state_noise * np.repeat([self.cfg.unmeasured_position, self.cfg.unmeasured_velocity], nv)
 
     def _spread(self, d: Demonstration, measured: np.ndarray | None) -> np.ndarray:
         """Return the standard deviation of the first state of a demonstration, see `start_spread`."""
@@ -502,8 +418,8 @@ class ObservedRecording:
             return None
         state, noise = self.state(d, start), {r.channel: r.std for r in readings}
         spread = start_spread(m, noise, self.cfg, measured=None if state.measured.all() else state.measured)
-        if start > 0.0 and not state.measured.all() and (guided := self.guided(d)) is not None:
-            spread = self._guided_spread(guided, start, spread)
+        if start > 0.0 and not state.measured.all() and self.guided(d) is not None:
+            spread = np.where(np.tile(state.measured, 2), spread, np.minimum(spread, self._known(m.nv)))
         clocks = np.concatenate(clock)
         found = Window(d, number, start, end, state.qpos, state.qvel, spread, tuple(readings), count, clocks)
         if not shared:
@@ -514,22 +430,6 @@ class ObservedRecording:
             column += part.shape[1]
         return replace(found, common=common, scatter=NumericalScatter(common))
 
-    def _guided_spread(self, guided: GuidedReplay, start: float, spread: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of a state of which replays tell what was not measured, shape (2 nv,).
-
-        Of that it is the replays', at least that of coordinates that no sensor measures and at most that of ones that
-        nothing tells.
-
-        Args:
-            guided: The replays.
-            start: When [s].
-            spread: Standard deviation where nothing but the readings tells the state, shape (2 nv,).
-        """
-        nv = len(spread) // 2
-        least = self.cfg.state_noise * np.repeat([self.cfg.unmeasured_position, self.cfg.unmeasured_velocity], nv)
-        told = np.clip(guided.deviation_at(start), np.minimum(least, spread), spread)
-        return np.where(np.tile(guided.partial.measured, 2), spread, told)
-
     def _stated(self, name: str) -> float:
         """Return the noise of a channel with covariances as the recording states it, that of all demonstrations."""
         channels = [d.measured[name] for d in self.recording.demonstrations if name in d.measured]
@@ -538,9 +438,10 @@ class ObservedRecording:
 
 
 def _sees_each_free_body(m: mujoco.MjModel, partial: PartialStateEstimator) -> bool:
-    """Return whether something of the position of each body that moves freely was measured, of one at least."""
+    """Return whether bodies move freely, and of each the orientation and some of the position was measured."""
     first = m.jnt_dofadr[m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
-    return len(first) > 0 and all(partial.measured[dof : dof + 3].any() for dof in first)
+    seen = [partial.measured[dof : dof + 3].any() and partial.measured[dof + 3 : dof + 6].all() for dof in first]
+    return len(seen) > 0 and all(seen)
 
 
 def first_time(d: Demonstration, channels: Sequence[str]) -> float:

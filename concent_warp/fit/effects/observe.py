@@ -12,13 +12,9 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import pooled_noise
 from concent_warp.estimation.sensors import kind_and_unit
-from concent_warp.fit.effects.observation import (
-    ObservationCfg,
-    ObservedRecording,
-    Window,
-    first_time,
-    start_spread,
-)
+from concent_warp.fit.effects.guided_replay import GuidedReplay
+from concent_warp.fit.effects.observation import ObservedRecording, Window, first_time, start_spread
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.prediction import turn
 from concent_warp.fit.effects.scatter import touches, with_scatter
 from concent_warp.simulate.engine import Variants
@@ -26,7 +22,6 @@ from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.partial_state import PartialStateEstimator
     from concent_warp.estimation.state_estimator import StateEstimator
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
@@ -122,16 +117,15 @@ def observe(
         channels = [c for c in source.noise if c in d.measured]
         last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
         start = 0.0 if d.qpos is not None or d.action else first_time(d, channels)
-        measured: StateEstimator | PartialStateEstimator | None = source.measured(d)
-        if measured is None and rough and (guided := source.guided(d)) is not None:
-            measured = guided.partial
+        measured = source.measured(d) or (source.guided(d) if rough else None)
         while start < last - 1e-6:
             end = last
             if measured is not None:
                 reach = length
                 if reach is None:
                     reach = keeps_close(source, d, start, min(last, start + longest), engine, seed)
-                end = last if last - start - reach < cfg.min_length else _calmest(measured, start, reach, cfg)
+                end = np.inf if last - start - reach < cfg.min_length else _calmest(measured, start, reach, cfg)
+                end = end if last - end >= cfg.min_length else last
             if (window := source.window(number, start, end)) is not None:
                 windows.append(window)
             start = end
@@ -251,11 +245,20 @@ def _rms(value: np.ndarray) -> np.ndarray:
     return np.sqrt((value**2).mean(axis=-1))
 
 
-def _calmest(
-    measured: StateEstimator | PartialStateEstimator, start: float, reach: float, cfg: ObservationCfg
-) -> float:
-    """Return the time at which a window ends [s]: late, and not in an impact, where velocities are unknown."""
+def _calmest(measured: StateEstimator | GuidedReplay, start: float, reach: float, cfg: ObservationCfg) -> float:
+    """Return the time at which a window ends [s]: late, and not in an impact, where velocities are unknown.
+
+    Where a part of the motion was not measured, it is one at which replays tell it; infinite where there is none.
+    """
     times = start + np.linspace(reach, 0.35 * reach, 27)
+    if isinstance(measured, GuidedReplay):
+        known = measured.is_known(times)
+        if not known.any():
+            later = measured.time[measured.time > start + reach]
+            times, known = later, measured.is_known(later)
+        if not known.any():
+            return np.inf
+        times = times[known]
     rough = measured.scatter_of_both_sides(times)
     calm = np.flatnonzero(rough < cfg.max_scatter)
     return float(times[calm[0] if len(calm) else rough.argmin()])

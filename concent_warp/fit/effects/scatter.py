@@ -18,7 +18,8 @@ import numpy as np
 
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.impacts import impact_deviations
-from concent_warp.fit.effects.observation import NumericalScatter, ObservationCfg, Window
+from concent_warp.fit.effects.observation import NumericalScatter, Window
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands

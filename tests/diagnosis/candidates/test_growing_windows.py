@@ -13,7 +13,8 @@ from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
-from concent_warp.fit.effects.observation import ObservationCfg, TimeStepDefect, first_part
+from concent_warp.fit.effects.observation import TimeStepDefect, first_part
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording

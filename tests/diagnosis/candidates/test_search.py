@@ -29,7 +29,7 @@ from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import BlockCfg, cut_blocks
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
-from concent_warp.fit.effects.observation import ObservationCfg
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.prediction import Prediction
 from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
 

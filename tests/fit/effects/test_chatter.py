@@ -7,7 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from concent_warp.fit.effects.observation import NumericalScatter, ObservationCfg, Window
+from concent_warp.fit.effects.observation import NumericalScatter, Window
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.scatter import _of_single_bodies
 from concent_warp.model import Model

@@ -11,7 +11,8 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState
 from concent_warp.fit.effects import observe as observing
-from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, first_time, start_spread
+from concent_warp.fit.effects.observation import ObservedRecording, first_time, start_spread
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import _calmest, channel_noises, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from concent_warp.fit.effects.impacts import Impact, flying_bodies, impact_deviations, impacts
-from concent_warp.fit.effects.observation import ObservationCfg, Window
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model

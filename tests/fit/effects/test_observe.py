@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, start_spread
+from concent_warp.fit.effects.observation import ObservedRecording, start_spread
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, moves_untouched, observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model

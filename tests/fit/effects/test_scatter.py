@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.fit.effects.observation import NumericalScatter, ObservationCfg, Window, first_part
+from concent_warp.fit.effects.observation import NumericalScatter, Window, first_part
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.scatter import with_scatter

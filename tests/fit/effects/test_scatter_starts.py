@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.fit.effects.observation import ObservationCfg, Window
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.observation_cfg import ObservationCfg
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.scatter import _touching_dofs, touches, with_scatter
 from concent_warp.model import Model
