@@ -17,15 +17,27 @@ TITLES = {
     "world": "World",
     "measurement": "Measurement",
 }
-ACTS_ON = {"none": "the world", "joint": "joints", "actuator": "actuators", "body": "bodies", "sensor": "sensors"}
+ACTS_ON = {"none": "the world", "sensor": "sensors", "body": "bodies"} | {
+    n: f"{n}s" for n in ("joint", "tendon", "actuator")
+}
 
 
-def _catalogue(m: mujoco.MjModel) -> str:
-    """Return a Markdown table for each family of this library's effects.
+def sprung_shape_sorter() -> mujoco.MjModel:
+    """Return a scene on which every effect of this library can act: the shape sorter, its block on an elastic cord."""
+    from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
-    Args:
-        m: A model on which each of them can act: units are those on its joints and sensors.
-    """
+    spec = ShapeSorterCfg().build().spec()
+    spec.worldbody.add_site(name="hook", pos=[0.0, 0.0, 1.0])
+    spec.body("block").add_site(name="eye")
+    cord = spec.add_tendon(name="cord", stiffness=[1.0, 0.0, 0.0], springlength=[1.0, 1.0])
+    for site in ("hook", "eye"):
+        cord.wrap_site(site)
+    return spec.compile()
+
+
+def _catalogue() -> str:
+    """Return a Markdown table for each family of this library's effects; units are those on `sprung_shape_sorter`."""
+    m = sprung_shape_sorter()
     parts = []
     for family in get_args(Family):
         rows = [_row(effect, m) for effect in OURS if effect.family == family]
@@ -69,6 +81,4 @@ def _unit(found: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    from concent_warp.scene.shape_sorter import ShapeSorterCfg
-
-    print(_catalogue(ShapeSorterCfg().build().model), end="")
+    print(_catalogue(), end="")

@@ -9,7 +9,17 @@ from functools import cache
 from importlib.metadata import entry_points
 
 from concent_warp.effects.effect import Effect
-from concent_warp.effects.library import contact, drives, geometry, joints, measurement, nominal, objects, world
+from concent_warp.effects.library import (
+    contact,
+    drives,
+    geometry,
+    joints,
+    measurement,
+    nominal,
+    objects,
+    tendons,
+    world,
+)
 from concent_warp.errors import ModelError
 
 GROUP = "concent_warp.effects"
@@ -28,6 +38,8 @@ OURS: tuple[type[Effect], ...] = (
     drives.JointCompliance,
     joints.JointOffset,
     drives.GravityCompensation,
+    tendons.TendonStiffness,
+    tendons.TendonDamping,
     objects.Mass,
     objects.CenterOfMass,
     objects.Inertia,

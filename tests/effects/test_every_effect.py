@@ -51,11 +51,23 @@ GRASP = """
   <position name="right" joint="right" kp="300" kv="10"/></actuator>
 <sensor><framepos name="block" objtype="body" objname="block"/><jointpos name="lift" joint="lift"/></sensor></mujoco>"""
 
+CORD = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><site name="hook" pos="0 0 0.6"/>
+  <body name="bob"><freejoint/><geom name="bob" size="0.04" mass="0.4"/><site name="eye" pos="0 0 0.03"/></body>
+  <body name="sled" pos="1 0 0"><joint name="sled" type="slide" damping="0.5"/>
+    <geom name="sled" size="0.04" mass="0.4"/>
+    <body name="load"><joint name="load" type="slide"/><geom name="load" size="0.03" mass="0.2"/></body></body>
+</worldbody><tendon>
+  <spatial name="cord" stiffness="60" damping="0.2" springlength="0.45"><site site="hook"/><site site="eye"/></spatial>
+  <fixed name="band" stiffness="30"><joint joint="load" coef="1"/></fixed></tendon>
+<sensor><framepos name="bob" objtype="body" objname="bob"/><jointpos name="load" joint="load"/></sensor></mujoco>"""
+
 TIME = np.arange(300) * 0.002
 CLOSING = 0.03 * np.clip(TIME / 0.2, 0, 1)
 SCENES = {
     "arm": (ARM, {"ctrl": np.stack([np.sin(6 * TIME), np.sign(np.sin(9 * TIME))], axis=1), "qvel": [0.5, -0.5]}),
     "toss": (TOSS, {"qvel": [1.5, 0.3, 0, 1, 2, 3]}),
+    "cord": (CORD, {"qvel": [0.2, 0.1, 0.3, 0, 0, 0, 0.5, -0.6]}),
     "grasp": (GRASP, {"ctrl": np.stack([0.1 * np.clip(TIME - 0.3, 0, 0.3), CLOSING, CLOSING], axis=1)}),
 }
 MODELS = {scene: Model(Scene(xml)) for scene, (xml, _) in SCENES.items()}
@@ -63,7 +75,7 @@ FOUND: list[tuple[str, Effect]] = [
     (scene, cls(*target))
     for cls in effect_classes().values()
     for scene, model in MODELS.items()
-    for target in cls.targets(model.compile())
+    for target in (*cls.targets(model.compile()), *cls.single_targets(model.compile()))
 ]
 CASES = [pytest.param(scene, e, id=f"{e.name} {scene} {' '.join(e.target)}") for scene, e in FOUND]
 VARYING = [
@@ -85,7 +97,7 @@ def first_case(name: str) -> tuple[Model, Effect]:
 def typical(effect: Effect, model: Model) -> list[float]:
     """Return values away from null."""
     rows = effect.parameters(model.compile())
-    return [p.scan[0] if p.scan else min(p.null + p.scale, p.high) for p in rows]
+    return [p.scan[0] if p.scan else p.null + (p.scale if p.null < p.high else -p.scale) for p in rows]
 
 
 @pytest.fixture(scope="module")

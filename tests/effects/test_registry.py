@@ -72,4 +72,4 @@ def test_documentation_lists_the_effects_as_they_are():
     page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
     begin, end = "python -m concent_warp.effects.catalogue` -->\n", "<!-- end of effects -->"
     listed = page[page.index(begin) + len(begin) : page.index(end)]
-    assert listed == _catalogue(ShapeSorterCfg().build().model)
+    assert listed == _catalogue()

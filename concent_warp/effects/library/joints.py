@@ -33,6 +33,8 @@ FARTHEST_REST = 1e4
 precision of the force."""
 
 
+USUAL_SHARE = 0.3
+"""Typical difference of a value from the model's, relative to it [-]."""
 LONGEST_LAG = 0.5
 """Longest time by which damping makes a joint follow its position-controlled drive later [s], as that of a lag of the
 drive itself."""
@@ -64,7 +66,11 @@ class JointEffect(Effect):
     def parameter_per_joint(
         self, name: str, unit: str, null: np.ndarray, scale: np.ndarray, high: np.ndarray, typical: float = 0.0
     ) -> tuple[Parameter, ...]:
-        """Return one parameter a joint, from 0 up; `typical` is in units of the scale."""
+        """Return one parameter a joint, from 0 up; `typical` is in units of the scale.
+
+        What the model has already is off by a share of it.
+        """
+        scale = np.maximum(scale, USUAL_SHARE * null)
         rows = zip(self.target, null, high, scale, strict=True)
         return tuple(
             Parameter(f"{name}[{t}]", unit, float(n), 0.0, float(h), float(s), typical=typical * float(s))
@@ -184,8 +190,11 @@ class JointStiffness(JointEffect):
             1 / 0.3,
         )
         unit, farthest = self.units(m, "N m", "N"), np.maximum(200 * typical, 5 * np.abs(preload))
+        typical = np.maximum(typical, np.abs(preload))
         preloads = (
-            Parameter(f"preload[{n}]", unit, float(p), -float(far), float(far), 0.3 * float(t), typical=float(t))
+            Parameter(
+                f"preload[{n}]", unit, float(p), -float(far), float(far), USUAL_SHARE * float(t), typical=float(t)
+            )
             for n, p, far, t in zip(self.target, preload, farthest, typical, strict=True)
         )
         return (*stiffnesses, *preloads)

@@ -284,6 +284,7 @@ class NominalTendonStiffness(Effect):
     source = "tolerance of nominal values"
     signature = "residual force along the tendon in proportion to its spring's"
     confusions = ("joint_stiffness", "joint_friction", "actuator_gain")
+    part_of = "tendon_stiffness"
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
