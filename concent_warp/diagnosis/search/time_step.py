@@ -130,7 +130,8 @@ def _at_states_of_shorter_step(one: FittedModel, cfg: TimeStepCfg) -> FittedMode
     lost = [w for w in lost if left[w] < cfg.max_misfit_left * before[w]]
     if not lost:
         return None
-    iterations = one.cfg.least_squares.initial_states.iterations
+    # Whether the shorter step is the reason shows soon; random restarts with so many steps take the longest of all.
+    iterations = max(one.cfg.least_squares.initial_states.iterations // 3, 1)
     found, starts, _ = solver.search.refined(one.fit.values, measured, lost, iterations)
     offsets = tuple(found[w] if w in starts else o for w, o in enumerate(one.fit.offsets))
     fit = replace(one.fit, offsets=offsets, starts=tuple(starts.get(w, a) for w, a in enumerate(one.fit.starts)))
