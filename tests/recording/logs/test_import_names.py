@@ -2,6 +2,7 @@
 
 import pytest
 
+from concent_warp.cli import main
 from concent_warp.recording.logs.suggest import suggest_map
 
 ARM = """<mujoco><worldbody><body><joint name="{a}" axis="0 1 0"/><geom size="0.1"/>
@@ -53,3 +54,30 @@ def test_the_one_channel_that_is_left_is_suggested_for_the_one_actuator(tmp_path
 )
 def test_channels_that_may_be_of_other_things_are_not_suggested_for_an_actuator(tmp_path, columns, actuator):
     assert "# [action.force]  # no channel found" in suggested(tmp_path, columns, actuator)
+
+
+def test_a_dry_run_names_the_sensors_without_a_channel(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    suggested(tmp_path, "shoulder_q,elbow_q,tip")
+    command = ["import", "log.csv", "--model", "arm.xml", "--map", "map.toml", "--dry-run"]
+    last = "leave out --dry-run and add -o demo.h5 to import it\n"
+    for entries, said in (
+        ('shoulder_q = "shoulder_q"\nelbow_q = "elbow_q"', "nothing is wrong"),
+        (
+            'shoulder_q = "shoulder_q"',
+            "nothing is wrong, but no channel is mapped to sensor 'elbow_q' of the scene: "
+            "if the log has it, add it to the map",
+        ),
+    ):
+        (tmp_path / "map.toml").write_text(f"[measured]\n{entries}\n")
+        assert main(command) == 0
+        assert f"{said}; {last}" in capsys.readouterr().out
+    model = tmp_path / "arm.xml"
+    more = "".join(f'<jointvel name="v{k}" joint="elbow"/>' for k in range(9))
+    model.write_text(model.read_text().replace("</sensor>", f"{more}</sensor>"))
+    assert main(command) == 0
+    named = (
+        "no channel is mapped to sensors 'elbow_q', 'v0', 'v1', 'v2', 'v3', 'v4', 'v5', 'v6' and 2 more of the scene"
+    )
+    assert named in capsys.readouterr().out
