@@ -152,7 +152,7 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
         return Noise(np.nan, "unknown")
     floor = 0.0 if kind == "orientation" else _resolution(pieces) / np.sqrt(12)
     found = _noise_in_differences(timed, kind, floor, cfg)
-    fast = _difference_std(timed, kind, 1, floor, cfg)
+    (fast,) = _difference_stds(timed, kind, (1,), floor, cfg)
     if (rest := _rest_std(pieces, kind, max(fast, floor), cfg)) is not None:
         scatter, freedom = rest
         std, error = max(scatter, fast), 2 / np.sqrt(2 * freedom)
@@ -205,7 +205,7 @@ def _noise_in_differences(
     """
     pieces = [piece for _, piece in timed]
     lags = [h for h in cfg.lags if sum(max(len(piece) - 3 * h, 0) for piece in pieces) >= cfg.min_readings]
-    values = [_difference_std(timed, kind, h, floor, cfg) for h in lags or cfg.lags[:1]]
+    values = _difference_stds(timed, kind, lags or cfg.lags[:1], floor, cfg)
     std, low, high = values[0], 0.0, values[0]
     most = cfg.max_share * _spread(pieces, kind)
     for k, (near, far) in enumerate(pairwise(values)):
@@ -222,13 +222,33 @@ def _spread(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     return float(np.sqrt(np.mean(centred**2)))
 
 
-def _difference_std(
-    timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, lag: int, floor: float, cfg: NoiseCfg
-) -> float:
-    """Return the noise per component seen in third differences, by their median size, so that impacts count little.
-
-    Of orientations the first difference is the rotation vector from one reading to a later one. No noise is below
+def _difference_stds(
+    timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, lags: Sequence[int], floor: float, cfg: NoiseCfg
+) -> list[float]:
+    """Return the noise per component seen in third differences over each lag, by their median size, so that impacts
+    count little, or by the smallest where most are motion in steps (`NoiseCfg.max_outer_scale`). No noise is below
     `floor`, what the resolution leaves.
+
+    Where the median tells the noise at one lag, it does at all larger ones: the smallest differences over a larger lag
+    are of other moments, and the two scales are no growth from one lag to the next.
+    """
+    found: list[float] = []
+    in_steps: np.ndarray | bool = True
+    for lag in lags:
+        third = _third_differences(timed, kind, lag)
+        if third is None:
+            found.append(np.nan)
+            continue
+        inner, outer = np.array([_scales(column, np.sqrt(20) * floor, cfg) for column in np.abs(third).T]).T
+        in_steps = in_steps & (outer > cfg.max_outer_scale * inner)
+        found.append(float(np.sqrt(np.mean(np.where(in_steps, inner, outer) ** 2) / 20)))
+    return found
+
+
+def _third_differences(timed: Sequence[tuple[np.ndarray, np.ndarray]], kind: Kind, lag: int) -> np.ndarray | None:
+    """Return the third differences over a lag, shape (n, dim), None where readings are too few.
+
+    Of orientations the first difference is the rotation vector from one reading to a later one.
     """
     third = []
     for time, piece in timed:
@@ -240,17 +260,13 @@ def _difference_std(
             )
             before, middle, after = _weights(time, lag)
             third.append(after * first[2 * lag :] + middle * first[lag:-lag] + before * first[: -2 * lag])
-    if not third:
-        return np.nan
-    spread = np.array([_inner_scale(column, np.sqrt(20) * floor, cfg) for column in np.abs(np.concatenate(third)).T])
-    return float(np.sqrt(np.mean(spread**2) / 20))
+    return np.concatenate(third) if third else None
 
 
-def _inner_scale(sizes: np.ndarray, floor: float, cfg: NoiseCfg) -> float:
-    """Return the standard deviation of a normal distribution by the sizes of differences, shape (n,), by their median.
+def _scales(sizes: np.ndarray, floor: float, cfg: NoiseCfg) -> tuple[float, float]:
+    """Return the standard deviation of a normal distribution by the sizes of differences, shape (n,), in two ways.
 
-    Where the smallest are far smaller than belongs to such a median, it is that of these: their root mean square, of
-    all that are within `NoiseCfg.clip` of it.
+    First by the smallest: their root mean square, of all that are within `NoiseCfg.clip` of it. Then by the median.
     """
     inner, outer = (float(np.quantile(sizes, q)) / z for q, z in ((0.1, 0.12566), (0.5, 0.67449)))
     apart = sizes[sizes > SAME * outer]
@@ -262,7 +278,7 @@ def _inner_scale(sizes: np.ndarray, floor: float, cfg: NoiseCfg) -> float:
         before, scale = scale, max(float(np.sqrt(np.mean(within**2))), floor)
         if scale >= (1 - 1e-3) * before:
             break
-    return scale if outer > cfg.max_outer_scale * scale else outer
+    return scale, outer
 
 
 def _weights(time: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

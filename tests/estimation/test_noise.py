@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfilt
+from scipy.signal import butter, lfilter, sosfilt
 from scipy.spatial.transform import Rotation
 
 from concent_warp.estimation.noise import NoiseCfg, channel_noise, pooled_noise
@@ -231,3 +231,18 @@ def test_noise_of_a_smooth_motion_is_read_by_the_median_whatever_the_resolution(
         read = np.round(read / (1e-3 * resolution)) * 1e-3 * resolution
     found = channel_noise(Channel(time, read), "joint")
     assert found.std == pytest.approx(1e-3 * np.sqrt(1 + resolution**2 / 12), rel=0.35)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pushes_with_short_rests_between_them_are_no_noise(seed):
+    """Over 4 samples most differences are motion; over 8 the smallest ones, those of rests, are about as large."""
+    place, asked = 0.0, []
+    for target, samples, rest in ((0.22, 50, 40), (0.1, 50, 20), (0.4, 45, 60), (0.7, 45, 80)):
+        u = np.arange(samples) / samples
+        asked += [place + (target - place) * (10 * u**3 - 15 * u**4 + 6 * u**5), np.full(rest, target)]
+        place = target
+    followed = np.asarray(lfilter([0.13], [1, -0.87], np.concatenate(asked)))
+    read = followed + 3e-5 * np.random.default_rng(seed).normal(size=len(followed))
+    found = channel_noise(Channel(0.01 * np.arange(len(read)), read[:, None]), "joint")
+    assert found.std == pytest.approx(3e-5, rel=0.2)
+    assert found.low < 3.1e-5 < found.high < 1e-4

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
+LISTED = 8
+"""Most sensors that one sentence names."""
+
+
 @dataclass(frozen=True)
 class Arguments:
     """Read LeRobot data sets, MCAP files, ROS bags, tables or folders of images as a recording, with a map of names,
@@ -133,6 +137,7 @@ def _dry_run(arguments: Arguments, cfg: ImportCfg) -> None:
         RecordingError: Something is wrong.
     """
     wrong: dict[str, list[str]] = {}
+    without: list[str] = []
     episodes = inspect_log(arguments.source, arguments.model, cfg, mapping=arguments.mapping)
     for k, episode in enumerate(episodes):
         name = episode.demonstration.name
@@ -141,6 +146,7 @@ def _dry_run(arguments: Arguments, cfg: ImportCfg) -> None:
         say(_table(episode.channels))
         if k == 0 and episode.unused:
             say(escape(f"not mapped: {', '.join(sorted(episode.unused))}"))
+        without = [one for one in episode.unmeasured if k == 0 or one in without]
         for error in episode.problems:
             wrong.setdefault(str(error), []).append(name)
     if len(wrong) == 1:
@@ -149,7 +155,18 @@ def _dry_run(arguments: Arguments, cfg: ImportCfg) -> None:
         say(escape(f"{k + 1}. {names[0]}{', ...' * (len(names) > 1)}: {sentence}"))
     if wrong:
         raise RecordingError(f"{len(wrong)} things are wrong", where=arguments.source[0], fix="see the list above")
-    say("nothing is wrong; leave out --dry-run and add -o demo.h5 to import it")
+    say(f"nothing is wrong{escape(_unmeasured(without))}; leave out --dry-run and add -o demo.h5 to import it")
+
+
+def _unmeasured(sensors: Sequence[str]) -> str:
+    """Return what is to be known of sensors of the scene that have no channel in any episode; empty without any."""
+    if not sensors:
+        return ""
+    more = f" and {len(sensors) - LISTED} more" if len(sensors) > LISTED else ""
+    named = ", ".join(map(repr, sensors[:LISTED])) + more
+    if len(sensors) == 1:
+        return f", but no channel is mapped to sensor {named} of the scene: if the log has it, add it to the map"
+    return f", but no channel is mapped to sensors {named} of the scene: add those that the log has to the map"
 
 
 def _table(channels: Sequence[ReadChannel]) -> Table:

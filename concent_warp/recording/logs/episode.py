@@ -56,6 +56,8 @@ class ReadEpisode:
     problems: list[RecordingError] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
     """Channels of the log that the map does not name."""
+    unmeasured: list[str] = field(default_factory=list)
+    """Named sensors of the scene without a channel."""
     behind: dict[str, int] = field(default_factory=dict)
     """Samples that were out of order and were sorted, by kind and name of their channel."""
 
@@ -116,7 +118,9 @@ def read_episode(
     made = Demonstration(name, episode.task, episode.success, None, None, action, measured, image=image)
     distinct = list({str(error): error for error in problems}.values())
     behind = {one.label: one.behind for one in channels if one.behind}
-    return ReadEpisode(made, start, lines, cameras, distinct, _unused(episode, mapping, channels), behind)
+    unmeasured = [name for name in targets_of(m)[1] if name not in measured]
+    unused = _unused(episode, mapping, channels)
+    return ReadEpisode(made, start, lines, cameras, distinct, unused, unmeasured, behind)
 
 
 def _unused(episode: Episode, mapping: LogMap, channels: list[Numbers]) -> list[str]:

@@ -13,7 +13,7 @@ from concent_warp.recording.logs.cfg import PlausibilityCfg
 from concent_warp.recording.logs.log_map import ClockEntry, LogMap, NumberEntry
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.targets import Target
-from concent_warp.recording.logs.units import SHARES, SI, TIMES, UNITS, named_unit
+from concent_warp.recording.logs.units import SHARES, SI, TIMES, UNITS, contrary_unit, named_unit
 
 UNSEEN = Signal("", np.zeros(0), np.zeros(0))
 """In place of a component that the log does not have."""
@@ -110,12 +110,9 @@ def converted(
     signals = _sources(entry, target, episode, where)
     clocks = [mapping.clock_of(signal.name) for signal in signals]
     first = signals[0]
-    if entry.unit is None and entry.scale == 1 and (unit := named_unit(first.name, target.quantity)):
-        si = SI[target.quantity]
-        raise RecordingError(
-            f"its name states {unit}, and the map no unit", where=where, found=first.name,
-            fix=f'write unit = "{unit}" in the map, or unit = "{si}" if its values are in {si}',
-        )  # fmt: skip
+    if entry.unit is None and entry.scale == 1:
+        for signal in signals:
+            _check_name(signal.name, target, where)
     if any(not np.array_equal(signal.time, first.time) for signal in signals[1:]):
         raise RecordingError(
             "the numbers of one channel have different times", where=where, expected="channels of one topic or feature",
@@ -137,6 +134,23 @@ def converted(
     delay = delay_of(first, clocks[0])
     empty, behind = int((~filled).sum()), int((_behind(times_of(first, clocks[0])) > 0).sum())
     return Numbers(target, source, where, time, value, entry.unit, entry.noise_std, delay, repeated, empty, behind)
+
+
+def _check_name(name: str, target: Target, where: str) -> None:
+    """Refuse a channel without a unit in the map whose name states one that is not of SI, or of another quantity."""
+    si = SI[target.quantity]
+    if unit := named_unit(name, target.quantity):
+        other = f'unit = "{si}" if its values are in {si}' if si else "the unit that holds"
+        raise RecordingError(
+            f"its name states {unit}, and the map no unit", where=where, expected="a unit or a scale", found=name,
+            fix=f'write unit = "{unit}" in the map, or {other}',
+        )  # fmt: skip
+    if unit := contrary_unit(name, target.quantity):
+        raise RecordingError(
+            f"its name states {unit}, which is no unit of {target.quantity}, and the map no unit", where=where,
+            expected=f"a channel in {si}, or a scale", found=name,
+            fix=f'map another channel, or write unit = "{si}" if its values are in {si}',
+        )  # fmt: skip
 
 
 def times_of(stream: Signal | Images, clock: ClockEntry) -> np.ndarray:

@@ -18,7 +18,16 @@ from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.logs.scene_gaps import measured_gaps, nameless_actuators, unread_joints
 from concent_warp.recording.logs.suggest_vectors import VectorChoice, vector_choices
 from concent_warp.recording.logs.targets import Target, body_sensors, named_parts, targets_of
-from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
+from concent_warp.recording.logs.units import (
+    SHARES,
+    SI,
+    UNIT_WORDS,
+    UNITS,
+    contrary_unit,
+    parted_unit,
+    stated_unit,
+    words_of,
+)
 from concent_warp.scene.scene import Scene
 
 WORDS = {
@@ -28,6 +37,11 @@ WORDS = {
     "acceleration": ("acc", "accel", "acceleration", "accelerations"),
 }
 """Words that name a quantity and not a joint."""
+OF_QUANTITIES = {
+    "angle": "position", "length": "position", "angular velocity": "velocity", "velocity": "velocity",
+    "torque": "effort", "force": "effort", "acceleration": "acceleration", "angular acceleration": "acceleration",
+}  # fmt: skip
+"""What names call a quantity, as in `WORDS`, by that of a unit or an actuator."""
 FILLERS = ("observation", "action", "joint", "joints", "states", "command", "commands", "cmd", "goal", "data", "motor",
            "main", "follower", "leader", "actuator", "sensor", "measured", "servo", "target", "setpoint", "desired",
            "actual")  # fmt: skip
@@ -41,7 +55,9 @@ MAX_DEGREES = 720.0
 GAP = "# scene: "
 """Begins a line of a map that says what the scene lacks."""
 UNCALLED = "no name says command"
-"""Why torques that are taken for commands of motors may be measured ones."""
+"""Why channels that are taken for commands may be measured."""
+PART = re.compile(r"[a-z]?[wxyz]")
+"""Ends the name of a part of a vector or quaternion."""
 
 
 @dataclass(frozen=True)
@@ -81,27 +97,33 @@ def suggest_map(source: Source, model: Path | str | Scene, episode: int | None =
     efforts = [one for one in readings if _quantity(one.name) == "effort"]
     if not commands and len(efforts) == len(actuators) and not any(one.position for one in actuators.values()):
         readings = [one for one in readings if one not in efforts]
-        named = _matched(list(actuators.values()), efforts)
-        chosen = [replace(one, guess=", ".join(filter(None, (one.guess, UNCALLED)))) for one in named]
+        called = _matched(list(actuators.values()), efforts)
+        chosen = [replace(one, guess=", ".join(filter(None, (one.guess, UNCALLED)))) for one in called]
     else:
         chosen = _matched(list(actuators.values()), commands)
-    lines += _section("action", list(actuators.values()), chosen)
     joints = [one for one in sensors.values() if one.size == 1]
     measured = _matched([one for one in joints if one.position], _of(readings, "position"))
     measured += _matched([one for one in joints if one.velocity], _of(readings, "velocity"))
-    lines += _section("measured", [one for one in joints if one.position], measured)
     bodies = [m.body(i).name for i in range(1, m.nbody) if all(body_sensors(m, m.body(i).name))]
     poses = sorted({n.removesuffix("/orientation/w") for n in found.signals if n.endswith("/orientation/w")})
     poses = [one for one in poses if f"{one}/position/x" in found.signals]
-    lines += _bodies(bodies, poses)
     under = tuple(f"{pose}/" for pose in poses)
     used = {one.signal.name for one in (*chosen, *measured)} | {n for n in found.signals if n.startswith(under)}
+    several, vectors = [], []
     if not poses:
         several = [one for one in sensors.values() if one.size > 1]
-        free = [one for one in readings if one.name not in used and _quantity(one.name) == "position"]
-        vectors = vector_choices(several, free, ROOM)
+        loose = [one for one in readings if one.name not in used and _quantity(one.name) == "position"]
+        vectors = vector_choices(several, loose, ROOM)
         used |= {name for one in vectors for name in one.sources}
-        lines += _vectors(several, vectors)
+    named = {one.target.name for one in (*chosen, *measured)}
+    unread = any(one.position and one.name not in named for one in joints)
+    free = [one for one in found.signals.values() if one.name not in used]
+    more = _left_for([one for one in actuators.values() if one.name not in named], free, unread=unread)
+    chosen, used = chosen + more, used | {one.signal.name for one in more}
+    lines += _section("action", list(actuators.values()), chosen)
+    lines += _section("measured", [one for one in joints if one.position], measured)
+    lines += _bodies(bodies, poses)
+    lines += _vectors(several, vectors)
     lines += _images(found)
     if any(one.frames for one in found.signals.values()):
         lines += ["# [clock]  # the table has numbers of frames, and no times", '# "*" = { rate = ? }  # in Hz', ""]
@@ -131,13 +153,22 @@ def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
 
 def _quantity(name: str) -> str:
     """Return the quantity that a name says, position if it says none."""
+    return _said_quantity(name) or "position"
+
+
+def _said_quantity(name: str) -> str:
+    """Return the quantity that a name says by a word or the unit at its end, empty if it says none."""
     words = [word.rstrip("0123456789") for word in words_of(name)]
     said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
-    return said[-1] if said else "position"
+    unit = parted_unit(name)[1]
+    return said[-1] if said else OF_QUANTITIES[UNITS[unit][0]] if unit in UNITS else ""
 
 
 def _matched(targets: Sequence[Target], signals: Sequence[Signal]) -> list[_Choice]:
-    """Return a channel for each target that has one: by name first, what is left by order if the counts are equal."""
+    """Return a channel for each target that has one: by name first, what is left by order if the counts are equal.
+
+    A name that has the same words in another order is one where it is the only one for its target and no other's.
+    """
     positions = _of(signals, "position") if len(signals) != len(targets) else list(signals)
     found: dict[str, _Choice] = {}
     free = list(positions or signals)
@@ -148,10 +179,49 @@ def _matched(targets: Sequence[Target], signals: Sequence[Signal]) -> list[_Choi
             free.remove(hit)
             found[target.name] = _Choice(target, hit)
     left = [target for target in targets if target.name not in found]
+    alike = {target.name: [one for one in free if _same_words(target, one.name)] for target in left}
+    for target in left:
+        hits = alike[target.name]
+        if len(hits) == 1 and sum(hits[0] in others for others in alike.values()) == 1:
+            free.remove(hits[0])
+            found[target.name] = _Choice(target, hits[0])
+    left = [target for target in left if target.name not in found]
     if left and len(left) == len(free):
         pairs = zip(left, free, strict=True)
         found |= {target.name: _Choice(target, one, "by order") for target, one in pairs}
     return [found[target.name] for target in targets if target.name in found]
+
+
+def _same_words(target: Target, name: str) -> bool:
+    """Return whether a channel is named by the words of a target, or of its joint, in any order."""
+    keys = [sorted(key.split("_")) for key in (_key(target.name), _key(target.joint)) if key]
+    return any(sorted(key.split("_")) in keys for key in _keys(name))
+
+
+def _left_for(actuators: Sequence[Target], left: Sequence[Signal], *, unread: bool) -> list[_Choice]:
+    """Return channels that nothing else is mapped to, by order for as many actuators, where all may be commands.
+
+    Args:
+        actuators: Those without a channel.
+        left: The channels.
+        unread: Whether sensors of positions have no channel, so that one of unknown quantity may be theirs.
+    """
+    if len(actuators) != len(left) or not all(map(_may_command, actuators, left)):
+        return []
+    if unread and any(_quantity(one.name) == "position" for one in left):
+        return []
+    return [_Choice(*pair, f"by order, {UNCALLED}") for pair in zip(actuators, left, strict=True)]
+
+
+def _may_command(actuator: Target, one: Signal) -> bool:
+    """Return whether a channel may be an actuator's command: no part of a vector, nor said to be another quantity."""
+    said = _said_quantity(one.name)
+    last = parted_unit(one.name)[0][-1:]
+    return (
+        said in ("", OF_QUANTITIES.get(actuator.quantity, said))
+        and contrary_unit(one.name, actuator.quantity) is None
+        and not (last and PART.fullmatch(last[0]))
+    )
 
 
 def _section(kind: str, targets: Sequence[Target], choices: Sequence[_Choice]) -> list[str]:
@@ -188,11 +258,23 @@ def _vectors(targets: Sequence[Target], choices: Sequence[VectorChoice]) -> list
 
 
 def _unit(choice: _Choice) -> tuple[str, str]:
-    """Return the unit that the values suggest, and why; empty where SI fits."""
-    if unit := named_unit(choice.signal.name, choice.target.quantity):
-        return unit, ""
+    """Return the unit that the name states, else the one that the values suggest, and why; empty where SI fits."""
+    name, target = choice.signal.name, choice.target
     value = choice.signal.value[np.isfinite(choice.signal.value)]
-    target = choice.target
+    unit = stated_unit(name, target.quantity) or ""
+    if unit in SHARES:
+        why = "" if target.range else "the scene has no range"
+        return ("signed_percent" if unit == "percent" and value.size and value.min() < 0 else unit), why
+    if unit and unit not in SI.values():
+        return unit, ""
+    guess, why = _guessed_unit(value, target)
+    if other := contrary_unit(name, target.quantity):
+        return guess, f"its name states {other}, which is no unit of {target.quantity}"
+    return guess or ("" if why else unit), why
+
+
+def _guessed_unit(value: np.ndarray, target: Target) -> tuple[str, str]:
+    """Return the unit that values (n,) suggest, and why; empty where SI fits."""
     if not value.size or not target.position:
         return "", ""
     low, high = float(value.min()), float(value.max())
@@ -264,13 +346,15 @@ def _camera_name(name: str) -> str:
 
 def _keys(name: str) -> set[str]:
     """Return what may tell a channel's joint from another: all of its name, and what is behind topics or dots."""
-    return {_key(one) for one in (name, name.rpartition("/")[2], re.split(r"[/.]", name)[-1])}
+    before, unit = parted_unit(name)
+    parts = {_key(one) for one in (name, name.rpartition("/")[2], re.split(r"[/.]", name)[-1])}
+    return parts | ({_key("_".join(before))} if unit else set())
 
 
 def _key(name: str) -> str:
     """Return what tells one joint from another in a name."""
     quantities = {word for words in WORDS.values() for word in words}
-    quantities |= {*FILLERS, *NAMED, *SI_WORDS}
+    quantities |= {*FILLERS, *UNIT_WORDS}
     kept = [word for word in words_of(name) if word not in quantities]
     return "_".join(kept)
 

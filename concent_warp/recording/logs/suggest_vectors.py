@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.recording.logs.readers.log import Signal
 from concent_warp.recording.logs.targets import Target
-from concent_warp.recording.logs.units import NAMED, SI_WORDS, named_unit, words_of
+from concent_warp.recording.logs.units import UNITS, named_unit, parted_unit, words_of
 
 AXES = {3: "xyz", 4: "xyzw"}
 """Components by their number; a log has w last, unless its map says otherwise."""
@@ -70,9 +70,9 @@ def _groups(signals: Sequence[Signal], axes: str) -> Mapping[tuple[str, ...], Ma
     """
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for one in signals:
-        words = words_of(one.name)
-        while words and (words[-1] in NAMED or words[-1] in (*SI_WORDS, "m")):
-            words.pop()
+        words, unit = parted_unit(one.name)
+        if unit and UNITS.get(unit, ("",))[0] != "length":
+            continue
         if words and (hit := COMPONENT.fullmatch(words[-1])):
             found.setdefault((*words[:-1], hit[1]), {})[hit[2]] = one.name
     # Those of a quaternion are four, so that x, y and z of one are no position.

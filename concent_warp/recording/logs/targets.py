@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -41,6 +42,15 @@ OF_JOINTS: dict[int, tuple[Quantity, Quantity]] = {
     int(S.mjSENS_ACTUATORFRC): ("torque", "force"),
 }
 """Quantities of sensors of hinges and of slides."""
+Controlled = Literal["position", "velocity", "force"]
+CONTROLS: dict[Controlled, tuple[Quantity, Quantity]] = {
+    "position": ("angle", "length"),
+    "velocity": ("angular velocity", "velocity"),
+    "force": ("torque", "force"),
+}
+"""Quantities of controls of hinges and of slides."""
+FILTERS = (int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+"""Dynamics of actuators that leave the unit of their control."""
 LARGEST_ARM = 0.1
 """Largest coefficients up to which those of a fixed tendon may be moment arms [m], and its length one in metres."""
 POSITIONS = (int(S.mjSENS_JOINTPOS), int(S.mjSENS_TENDONPOS), int(S.mjSENS_ACTUATORPOS))
@@ -104,19 +114,35 @@ def body_sensors(m: mujoco.MjModel, body: str) -> tuple[str | None, str | None]:
 def actuator_target(m: mujoco.MjModel, row: int) -> Target:
     """Return an actuator."""
     name = m.actuator(row).name
-    gain, bias = m.actuator_gainprm[row, 0], m.actuator_biasprm[row, 1]
-    servo = m.actuator_biastype[row] == mujoco.mjtBias.mjBIAS_AFFINE and gain == -bias != 0
-    servo = servo and m.actuator_gear[row, 0] == 1
-    kind, target = m.actuator_trntype[row], int(m.actuator_trnid[row, 0])
-    angular, span, driven = _driven(m, int(kind), target)
-    quantity: Quantity = "any"
-    if angular is not None and servo:
-        quantity = "angle" if angular else "length"
-    elif m.actuator_ctrllimited[row] == 0 or not servo:
+    follows = _followed(m, row)
+    angular, span, driven = _driven(m, int(m.actuator_trntype[row]), int(m.actuator_trnid[row, 0]))
+    quantity: Quantity = "any" if angular is None or follows is None else CONTROLS[follows][0 if angular else 1]
+    servo = follows == "position"
+    if quantity == "any" or not servo:
         span = None
     if m.actuator_ctrllimited[row]:
         span = float(m.actuator_ctrlrange[row, 0]), float(m.actuator_ctrlrange[row, 1])
-    return Target(name, True, 1, quantity, span, driven, position=bool(servo))
+    return Target(name, True, 1, quantity, span, driven, position=servo)
+
+
+def _followed(m: mujoco.MjModel, row: int) -> Controlled | None:
+    """Return what the control of an actuator sets, None where its unit cannot be told, as behind a gear.
+
+    The force of MuJoCo's ``position`` is kp (control - position), less damping; that of ``velocity`` is
+    kv (control - velocity); ``intvelocity`` integrates a velocity to such a position; that of ``motor`` is its control.
+    """
+    if m.actuator_gear[row, 0] != 1 or m.actuator_gaintype[row] != mujoco.mjtGain.mjGAIN_FIXED:
+        return None
+    gain, bias = m.actuator_gainprm[row, 0], m.actuator_biasprm[row]
+    integrates = m.actuator_dyntype[row] == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    filters = m.actuator_dyntype[row] in FILTERS
+    if m.actuator_biastype[row] == mujoco.mjtBias.mjBIAS_AFFINE and gain != 0 and (integrates or filters):
+        if gain == -bias[1]:
+            return "velocity" if integrates else "position"
+        return "velocity" if filters and bias[1] == 0 and gain == -bias[2] else None
+    if m.actuator_biastype[row] == mujoco.mjtBias.mjBIAS_NONE and gain == 1 and filters:
+        return "force"
+    return None
 
 
 def _driven(m: mujoco.MjModel, kind: int, target: int) -> tuple[bool | None, tuple[float, float] | None, str]:
