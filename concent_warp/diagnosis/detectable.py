@@ -47,8 +47,9 @@ def detectable_text(name: str, parameter: str, size: float, unit: str, null: flo
         unit: SI unit, "-" for none.
         null: Value at which the effect does nothing.
     """
-    kind = name.split("(")[0]
-    rest = parameter.removeprefix(kind) if parameter.split("[")[0] == kind else f" {parameter}"
+    bare = parameter.split("[")[0]
+    repeated = f"_{name.split('(')[0]}".endswith(f"_{bare}")
+    rest = parameter.removeprefix(bare) if repeated else f" {parameter}"
     if unit == "-" and null:
         return f"{name}{rest}", number_text(100 * size / abs(null), 2), "% of the model's"
     return f"{name}{rest}", number_text(size, 2), "(no unit)" if unit == "-" else unit

@@ -126,13 +126,15 @@ def test_smallest_sizes_repeat_no_name_and_have_a_unit_or_a_share():
         Detectable("mass(pusher)", "mass", 0.0021, "-", 1.0),
         Detectable("sliding_friction", "coefficient", 0.0036, "-", 0.36),
         Detectable("sensor_gain", "scale[encoder]", 0.02, "-", 0.0),
+        Detectable("length_scale", "scale", 9e-4, "-", 0.0),
         Detectable("center_of_mass", "z", 2.1e-4, "m", 0.0),
     )
     _, said = diagnosis(verdict="none_needed", effects=(), detectable=found).sentences()
     assert said == (
         "Smallest detectable sizes (from there on an effect would be noticed, were nothing else wrong; not how exactly "
         "its size would be known): inertia 3.2 % of the model's; mass(pusher) 0.21 % of the model's; sliding_friction "
-        "coefficient 1 % of the model's; sensor_gain scale[encoder] 0.02 (no unit); center_of_mass z 0.00021 m."
+        "coefficient 1 % of the model's; sensor_gain scale[encoder] 0.02 (no unit); length_scale 0.0009 "
+        "(no unit); center_of_mass z 0.00021 m."
     )
     assert diagnosis(detectable=found).to_json()["detectable"][2] == {
         "name": "sliding_friction", "parameter": "coefficient", "size": 0.0036, "unit": "-", "null": 0.36,
