@@ -217,7 +217,9 @@ class Model:
         document["scene"] = f"{path.stem}.scene.xml"
         if self.geometry is not None:
             document["geometry"] = f"{path.stem}.geometry.npz"
-        document["contact"] = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self.contact).items()}
+        if self.geometry is not None or self.contact != ContactParameters():  # they are those of spheres
+            contact = asdict(self.contact).items()
+            document["contact"] = {name: list(v) if isinstance(v, tuple) else v for name, v in contact}
         if self.effects:
             document["effect"] = effects_table(self.effects)
         if posteriors := posteriors_table(self.effects):

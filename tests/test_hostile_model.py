@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,18 @@ EFFECT = '\n[[effect]]\nname = "joint_friction"\ntarget = ["elbow"]\nvalues = [{
 @pytest.fixture
 def model(tmp_path) -> Path:
     return write_recording_and_model(tmp_path)[1]
+
+
+def test_contact_parameters_are_written_only_where_they_apply(model, tmp_path):
+    spheres = Model.load(model)
+    stiff = ContactParameters(solref=(0.004, 1.2))
+    bare = spheres.with_geometry(None)
+    for one, written in (
+        (spheres, True), (bare, False), (replace(bare, contact=stiff), True), (replace(spheres, contact=stiff), True),
+    ):  # fmt: skip
+        one.save(tmp_path / "again.toml")
+        assert ("[contact]" in (tmp_path / "again.toml").read_text()) is written
+        assert Model.load(tmp_path / "again.toml").contact == one.contact
 
 
 def refusal(path: Path) -> str:

@@ -48,9 +48,19 @@ def time_left(share: float, spent: float, seconds: float | None) -> float | None
     return most if share <= 0 else min(most, spent * (1 - share) / share)
 
 
-def _number(value: float) -> str:
-    """Return a parameter's value as text."""
-    return f"{value:.4g}" if np.isfinite(value) else "none" if value > 0 else "-none"
+def _number(value: float, step: float = 0.0) -> str:
+    """Return a parameter's value as text, with digits enough for differences of `step`."""
+    from concent_warp.comparison.units import number_text
+
+    return number_text(value, 4, step) if np.isfinite(value) else "none" if value > 0 else "-none"
+
+
+def _value_and_ends(p: FittedParameter) -> tuple[str, str, str]:
+    """Return the value of a parameter and the ends of its interval as text."""
+    from concent_warp.comparison.units import readable_step
+
+    step = readable_step(p.value, p.low, p.high)
+    return _number(p.value, step), _number(p.low, step), _number(p.high, step)
 
 
 def value_and_interval(p: FittedParameter, *, owner: bool = False) -> str:
@@ -58,7 +68,8 @@ def value_and_interval(p: FittedParameter, *, owner: bool = False) -> str:
     from concent_warp.effects.effect import with_unit
 
     name = p.name if owner else p.name.split("[")[0]
-    return with_unit(f"{name} {_number(p.value)} [{_number(p.low)}, {_number(p.high)}]", p.unit)
+    value, low, high = _value_and_ends(p)
+    return with_unit(f"{name} {value} [{low}, {high}]", p.unit)
 
 
 def say_fitted(fitted: FittedEffects) -> None:
@@ -70,8 +81,8 @@ def say_fitted(fitted: FittedEffects) -> None:
         table.add_column(name, justify="right" if name in ("value", "95 % interval", "null") else "left")
     for added, group in zip(fitted.model.effects, fitted.parameters, strict=True):
         for k, p in enumerate(group):
-            interval = f"{_number(p.low)} to {_number(p.high)}"
-            cells = [added.effect.name if k == 0 else "", p.name, _number(p.value), interval, p.unit, _number(p.null)]
+            value, low, high = _value_and_ends(p)
+            cells = [added.effect.name if k == 0 else "", p.name, value, f"{low} to {high}", p.unit, _number(p.null)]
             table.add_row(*map(escape, cells), end_section=k + 1 == len(group))
     say(table)
     table = Table(header_style="bold")

@@ -6,6 +6,8 @@ import numpy as np
 
 DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (180 / np.pi, "°"), "m/s": (1e3, "mm/s"), "rad/s": (180 / np.pi, "°/s")}
 """Factor and unit in which a unit is shown to people."""
+MOST_DIGITS = 9
+"""Most significant digits of a number [-]."""
 
 
 def value_text(value: float | None, unit: str, *, sign: bool = False) -> str:
@@ -17,6 +19,36 @@ def value_text(value: float | None, unit: str, *, sign: bool = False) -> str:
     value *= DISPLAY_UNITS.get(unit, (1, unit))[0]
     digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
     return f"{value:{'+' if sign else ''}.{digits}f}"
+
+
+def number_text(value: float, digits: int = 3, step: float = 0.0) -> str:
+    """Return a number with so many significant digits, more where they are before the point or needed for `step`.
+
+    From 1e-4 up to a million it has no exponent.
+    """
+    if not value or not np.isfinite(value):
+        return f"{value:g}"
+    leading = int(f"{value:.{digits - 1}e}".split("e")[1])
+    digits = max(digits, leading + 1) if leading < 6 else digits
+    if step > 0:
+        digits = max(digits, min(leading - int(np.floor(np.log10(step))) + 1, MOST_DIGITS))
+    return f"{value:.{digits}g}"
+
+
+def readable_step(value: float, low: float, high: float) -> float:
+    """Return the difference that must be seen in a value and the ends of its interval: a power of ten, 0 for any.
+
+    It is at most half of the interval's half width; of an interval that is open on one side, of the other one.
+    """
+    ends = [end for end in (low, high) if np.isfinite(end)]
+    reach = (high - low) / 2 if len(ends) == 2 else max((abs(value - end) for end in ends), default=0.0)
+    return float(10.0 ** np.floor(np.log10(reach / 2))) if np.isfinite(reach) and reach > 0 else 0.0
+
+
+def interval_texts(value: float, low: float, high: float, digits: int = 3) -> tuple[str, str, str]:
+    """Return a value and the ends of its interval, with digits enough to tell them apart."""
+    step = readable_step(value, low, high)
+    return number_text(value, digits, step), number_text(low, digits, step), number_text(high, digits, step)
 
 
 def percent_text(share: float) -> str:

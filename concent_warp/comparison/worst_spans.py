@@ -303,8 +303,8 @@ def _direction(residual: Residual, rows: np.ndarray, cfg: WorstSpanCfg) -> tuple
     vector = tuple(float(v) for v in mean)
     steady = float(np.linalg.norm(mean)) >= cfg.steady_share
     if len(mean) == 1:
-        side = "above" if mean[0] > 0 else "below"
-        return f"measured {side} the model" if steady else "to and fro", vector
+        side = "more" if mean[0] > 0 else "less"
+        return f"measured value {side} than the model's" if steady else "to and fro", vector
     if len(mean) != 3:
         return "", vector
     extent = mean if steady else np.sqrt((value**2).mean(axis=0))

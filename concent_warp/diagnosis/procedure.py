@@ -21,10 +21,11 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.check_data import check_data, noise_remarks, start_remarks
+from concent_warp.diagnosis.detectable import Detectable
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.replayed import Replayed, replayed
-from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
+from concent_warp.diagnosis.result import Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, is_near_noise, qualified_by_noise
 from concent_warp.diagnosis.search.alternatives import try_alternatives
@@ -408,12 +409,17 @@ class Procedure:
         if verdict == "none_of_these" and not adequate and step is not None and may_be_step(last, step, cfg.time_step):
             verdict, step = "unsettled", replace(step, too_long=True)
         named = verdict in ("effect", "group")
-        unsettled = "Left out: where the model fails, and the next experiment."
-        where = budget.attempt(lambda: () if explained else self._failures(given), (), unsettled)
-        experiment = budget.attempt(lambda: None if explained else self._suggested_experiment(), None, unsettled)
+        where = budget.attempt(
+            lambda: () if explained else self._failures(given), (), "Left out: where the model as given fails."
+        )
+        experiment = budget.attempt(
+            lambda: None if explained else self._suggested_experiment(), None, "Left out: the next experiment."
+        )
         after = fitted[1:] if fitted[0] is given else fitted
         replay = (cfg.explain or not named) and fitted[-1] is not given
-        alike = budget.attempt(lambda: self._replayed(given, last) if replay else None, None, unsettled)
+        alike = budget.attempt(
+            lambda: self._replayed(given, last) if replay else None, None, "Left out: a replay in one piece."
+        )
         # What is not named is saved only where it follows the recording better.
         least = cfg.min_explained if verdict == "none_of_these" else 0.0
         farther = not named and alike is not None and not alike.explains(least)

@@ -8,11 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from concent_warp.comparison.units import p_value_text
+from concent_warp.comparison.units import interval_texts, p_value_text
+from concent_warp.diagnosis.detectable import Detectable, detectable_sentence
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
 from concent_warp.diagnosis.replayed import Replayed
 from concent_warp.diagnosis.result_html import diagnosis_html
-from concent_warp.effects.effect import with_unit
+from concent_warp.diagnosis.values_text import SCATTER_CLAUSE, nominal_sentence, parameters_text
 from concent_warp.effects.table import posteriors_table
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
@@ -35,6 +36,8 @@ VERDICTS: dict[Verdict, str] = {
 STEP_TOO_LONG = "the time step of the model is too long for a verdict"
 NOISE_OPEN = "the noise is too uncertain for a verdict"
 """The same of "unsettled" where no time was short."""
+MOST_DETECTABLE = 6
+"""Effects whose smallest detectable sizes are named."""
 
 
 @dataclass(frozen=True)
@@ -229,17 +232,6 @@ class FinerTimeStep:
 
 
 @dataclass(frozen=True)
-class Detectable:
-    """The smallest size of an effect that this recording would reveal."""
-
-    name: str
-    parameter: str
-    size: float
-    """Difference from the null value, in `unit`."""
-    unit: str
-
-
-@dataclass(frozen=True)
 class Diagnosis:
     """Which physical effect a model lacks.
 
@@ -294,6 +286,9 @@ class Diagnosis:
     """Sentences on what there was no time for, see `DiagnoseCfg.seconds`."""
     explains: bool = True
     """Whether the accepted effects explain enough to be in `model`, see `DiagnoseCfg.min_explained`."""
+    rests_on_scatter: bool = False
+    """Whether what the last model leaves is no more than noise only because the scatter of simulated contacts over a
+    time step counts as such."""
     farther: bool = False
     """Whether `model` stays as given as what was found, and not named, makes a replay of the recording no better."""
 
@@ -322,10 +317,18 @@ class Diagnosis:
         if self.replayed is not None and self.verdict == "unsettled":
             return NOISE_OPEN
         if self.replayed is not None and self.replayed.doubtful:
-            return f"{VERDICTS[self.verdict]}, over short windows"
+            return f"{VERDICTS[self.verdict]}, over short windows{self._size_open}"
         if self.verdict == "unsettled" and self.time_step is not None and self.time_step.too_long:
             return STEP_TOO_LONG
-        return VERDICTS[self.verdict]
+        return f"{VERDICTS[self.verdict]}{self._size_open}"
+
+    @property
+    def _size_open(self) -> str:
+        """What the headline adds where the intervals of an effect that is named include no change."""
+        names = [f.name for f in self.accepted if f.may_be_null] if self.verdict == "effect" else []
+        if not names:
+            return ""
+        return ", but not its size" if len(self.accepted) == 1 else f", but not the size of {_joined(names, 'and')}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the diagnosis in plain types, as documented in ``docs/diagnose.md``."""
@@ -345,10 +348,8 @@ class Diagnosis:
             "nominal_values": [_parameter(p) for p in self.nominal_values],
             "posterior": self._posterior(),
             "ratio": list(self.ratio),
-            "detectable": [
-                {"name": d.name, "parameter": d.parameter, "size": _number(d.size), "unit": d.unit}
-                for d in self.detectable
-            ],
+            "rests_on_scatter": self.rests_on_scatter,
+            "detectable": [d.to_json() for d in self.detectable],
             "next_experiment": None if self.next_experiment is None else self.next_experiment.summary(),
             "issues": list(self.issues),
             "unsettled": list(self.unsettled),
@@ -385,6 +386,8 @@ class Diagnosis:
                 f"What is left, {self.ratio[-1]:.2f} x noise, is {_percent(self.form_error)} of the discrepancy: no "
                 "more than errors in the formulas of the accepted effects."
             )
+        if self.rests_on_scatter and self.verdict in ("effect", "group"):
+            said.append(f"Residuals are {self.ratio[-1]:.2f} x noise; {SCATTER_CLAUSE}.")
         if self.remainder_searched is False:
             said.append("Whether something smaller is missing too was not settled in this time.")
         if self.replayed is not None and self.replayed.doubtful:
@@ -400,29 +403,27 @@ class Diagnosis:
         """Return the result in sentences."""
         said = []
         if self.verdict == "none_needed":
-            said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise.")
+            beside = f"; {SCATTER_CLAUSE}" if self.rests_on_scatter else ""
+            said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise{beside}.")
             if self.detectable:
-                shown = "; ".join(
-                    with_unit(f"{d.name} {d.parameter} {d.size:.2g}", d.unit) for d in self.detectable[:6]
-                )
-                said.append(f"Smallest detectable sizes: {shown}.")
+                said.append(detectable_sentence(self.detectable[:MOST_DETECTABLE]))
         for k, finding in enumerate(self.accepted):
             group = self.groups[k] if k < len(self.groups) else (finding.name,)
-            values = ", ".join(
-                with_unit(f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}]", p.unit) for p in finding.parameters[:4]
-            )
             lead = "Missing" if k == 0 else "Then missing"
             lead = "The best so far" if self.verdict == "unsettled" else lead
             lead = "Explains a part" if self.verdict == "none_of_these" else lead
             said.append(
-                f"{lead}: {finding.name}{_owner(finding)} ({values}). "
+                f"{lead}: {finding.name}{_owner(finding)} ({parameters_text(finding.parameters)}). "
                 f"Held-out error falls by {100 * finding.gain:.0f} % "
                 f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
             )
             if len(group) > 1:
                 said.append(f"The data cannot distinguish it from {_joined(group[1:])}.")
             if finding.may_be_null:
-                said.append(f"Each interval of {finding.name} includes no change: the fall of the error speaks for it.")
+                said.append(
+                    f"Each interval of {finding.name} includes no change, as errors of nominal values within their "
+                    "tolerance, or of the fit, may be as large: the fall of the error speaks for it."
+                )
         if self.verdict == "none_of_these":
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
@@ -438,13 +439,7 @@ class Diagnosis:
         numerical = [h.sentence for h in self.holding]
         numerical += [] if self.time_step is None else [self.time_step.sentence]
         if self.nominal_values:
-            values = ", ".join(
-                f"{p.name} x {p.value:.3f} [{p.low:.3f}, {p.high:.3f}]"
-                if p.unit == "-"
-                else f"{p.name} {p.value:.2g} [{p.low:.2g}, {p.high:.2g}] {p.unit}"
-                for p in self.nominal_values
-            )
-            numerical.append(f"Nominal values were fitted within their tolerances: {values}.")
+            numerical.append(nominal_sentence(self.nominal_values))
         if self.farther and not self.accepted:
             numerical.append(FARTHER)
         return [*self.issues, *numerical, *said, *self.unsettled]
@@ -468,13 +463,14 @@ def _table_rows(finding: Finding) -> list[tuple[str, ...]]:
         (
             finding.name if k == 0 else "",
             p.name,
-            f"{p.value:.3g}",
-            f"{p.low:.3g} to {p.high:.3g}",
+            value,
+            f"{low} to {high}",
             p.unit,
             gain if k == 0 else "",
             finding.p_text if k == 0 else "",
         )
         for k, p in enumerate(finding.parameters)
+        for value, low, high in [interval_texts(p.value, p.low, p.high)]
     ]
 
 
@@ -494,6 +490,6 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _joined(names: Sequence[str]) -> str:
+def _joined(names: Sequence[str], last: str = "or") -> str:
     """Return names as a list in words."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}"

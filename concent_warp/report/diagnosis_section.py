@@ -9,7 +9,11 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from concent_warp.comparison.units import channel_text, p_value_text
+import numpy as np
+
+from concent_warp.comparison.units import channel_text, interval_texts, p_value_text
+from concent_warp.diagnosis.detectable import DETECTABLE_MEANING, detectable_text
+from concent_warp.diagnosis.values_text import SCATTER_CLAUSE
 from concent_warp.report.tables import Row, table
 
 MOST_EFFECTS = 10
@@ -53,11 +57,9 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
     if where := diagnosis.get("where"):
         found += ["<h3>Where it shows</h3>", bullet_list([entry["sentence"] for entry in where])]
     if limits := diagnosis.get("detectable"):
-        rows: list[Row] = [
-            ("", [escape(channel_text(d["name"])), _number(d["size"], 3), escape(d["unit"])]) for d in limits
-        ]
+        rows = [_detectable_row(entry) for entry in limits]
         opened = " open" if verdict == "none_needed" else ""
-        about = "<summary>Smallest detectable effects</summary>"
+        about = f"<summary>Smallest detectable effects ({DETECTABLE_MEANING})</summary>"
         found.append(f"<details{opened}>{about}{table(['effect', 'size', 'unit'], rows, 1)}</details>")
     if experiment := diagnosis.get("next_experiment"):
         found.append(f'<p class="next"><b>Next experiment</b> {escape(experiment["sentence"])}</p>')
@@ -75,8 +77,9 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
         left += " Whether something smaller is missing too was not settled in this time."
     if diagnosis["verdict"] == "none_needed":
         ratio = (diagnosis.get("ratio") or [1.0])[-1]
-        much = f"residuals are {ratio:.2f} x noise" if ratio > QUIET_RATIO else NOISE_REACHED
-        return f"No discrepancy was detected: {much}."
+        scatter = diagnosis.get("rests_on_scatter")
+        much = f"residuals are {ratio:.2f} x noise" if scatter or ratio > QUIET_RATIO else NOISE_REACHED
+        return f"No discrepancy was detected: {much}{f'; {SCATTER_CLAUSE}' if scatter else ''}."
     if diagnosis["verdict"] == "unsettled":
         best = f" The best so far: {_gain_sentence(accepted)}" if accepted else ""
         step = diagnosis.get("time_step") or {}
@@ -88,7 +91,7 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
         return f"The model lacks something, and the data cannot distinguish between {names}.{left}"
     if diagnosis["verdict"] == "effect":
         names = _listed([f"{channel_text(e['name'])} ({FAMILIES.get(e['family'], e['family'])})" for e in accepted])
-        return f"The model lacks {names}. {_gain_sentence(accepted)}{left}"
+        return f"The model lacks {names}. {_gain_sentence(accepted)}{_size_open(accepted)}{left}"
     lacks = "The model lacks something that none of the effects in the library explains"
     if not accepted:
         return f"{lacks}.{left}"
@@ -104,6 +107,30 @@ def _gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
         for e in effects
     ]
     return f"On data that the fit has not seen, {', '.join(parts)}."
+
+
+def _size_open(effects: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on the effects whose intervals all include no change, empty where there are none."""
+    names = [channel_text(e["name"]) for e in effects if _may_be_null(e["parameters"])]
+    if not names:
+        return ""
+    whose = "Its size" if len(effects) == 1 else f"The size of {_listed(names)}"
+    return f" {whose} is not known: each interval includes no change."
+
+
+def _may_be_null(parameters: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether each parameter, by itself, may be at the value at which the effect does nothing."""
+    return bool(parameters) and not any(_excludes_null(p) for p in parameters)
+
+
+def _excludes_null(parameter: Mapping[str, Any]) -> bool:
+    """Return whether the interval of a parameter excludes its null value; true where that is not given."""
+    low, high = parameter["interval"]
+    if "null" not in parameter:
+        return True
+    if parameter["null"] is None:  # a limit that is infinite by default
+        return high is not None
+    return (low is not None and parameter["null"] < low) or (high is not None and parameter["null"] > high)
 
 
 def _group_sentence(group: Sequence[str]) -> str:
@@ -145,15 +172,23 @@ def _parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
     for e in [e for e in effects if e["accepted"]] or effects[:1]:
         for k, p in enumerate(e["parameters"]):
             name = escape(channel_text(e["name"])) if k == 0 else ""
-            low, high = (_number(end, 4) for end in p["interval"])
-            value = f"<b>{_number(p['value'], 4)}</b>"
-            rows.append(("", [name, escape(p["name"]), value, f"{low} to {high}", escape(p["unit"])]))
+            value, low, high = _value_and_ends(p)
+            rows.append(("", [name, escape(p["name"]), f"<b>{value}</b>", f"{low} to {high}", escape(p["unit"])]))
     return rows
 
 
-def _number(value: float | None, digits: int) -> str:
-    """Return a number with so many significant digits, "∞" for one that JSON cannot hold."""
-    return "∞" if value is None else f"{value:.{digits}g}"
+def _value_and_ends(parameter: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the value of a parameter and the ends of its interval, "∞" for one that JSON cannot hold."""
+    known = [np.inf if x is None else x for x in (parameter["value"], *parameter["interval"])]
+    texts = interval_texts(known[0], known[1], known[2], 4)
+    return tuple(text if np.isfinite(x) else "∞" for x, text in zip(known, texts, strict=True))
+
+
+def _detectable_row(entry: Mapping[str, Any]) -> Row:
+    """Return the row of the smallest detectable size of an effect."""
+    size = np.inf if entry["size"] is None else entry["size"]
+    texts = detectable_text(entry["name"], entry["parameter"], size, entry["unit"], entry.get("null") or 0.0)
+    return "", [escape(channel_text(texts[0])), *(escape(text) for text in texts[1:])]
 
 
 def bullet_list(lines: Sequence[str]) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from concent_warp.cli import main
+from concent_warp.cli.commands.diagnose import _say_diagnosis
 from concent_warp.cli.fitted_effects import time_left
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose as diagnosed
@@ -16,6 +17,8 @@ from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Channel
+from concent_warp.scene.scene import Scene
+from tests.diagnosis.made_up import finding
 from tests.scenes.swinging import DAMPING, NOISE, swing_scene, swung
 
 FEW = ["--effects", "joint_damping", "armature", "--jobs", "1"]
@@ -287,3 +290,15 @@ def test_the_time_left_ends_with_the_time_given():
     assert time_left(0.1, 10.0, 60.0) == 50.0
     assert time_left(0.0, 10.0, 60.0) == 50.0
     assert time_left(0.5, 70.0, 60.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said", "other"), [("unsettled", "best so far", "accepted"), ("effect", "accepted", "best so far")]
+)
+def test_what_was_accepted_is_only_the_best_so_far_under_an_unsettled_verdict(verdict, said, other, capsys):
+    model = Model(Scene(swing_scene()))
+    effects = (finding("joint_friction", 0.8),)
+    _say_diagnosis(Diagnosis(verdict, effects, (), (), 0.0, (4.0, 1.0), (), None, (), (model, model)))
+    out = capsys.readouterr().out
+    assert f"joint_friction: {said}" in out
+    assert f"joint_friction: {other}" not in out

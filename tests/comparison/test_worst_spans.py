@@ -185,7 +185,7 @@ def test_the_worst_place_names_body_phase_partner_and_direction(pushed):
 def test_joints_name_the_contacts_of_the_body_that_they_move(pushed):
     place = next(p for p in pushed.worst_spans if p.channels[0] == "rail")
     assert place.against[0].startswith("block (-x")
-    assert place.direction == "measured above the model"
+    assert place.direction == "measured value more than the model's"
 
 
 def test_places_are_in_the_json_with_their_sentence(pushed):

@@ -44,7 +44,7 @@ def node(
     model = SimpleNamespace(effects=added, name=name, scene=MODEL.scene)
     # Residuals of one size, beyond the limit of the robust loss nowhere.
     piece = SimpleNamespace(residual=np.full(4, float(ratio)))
-    window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))], defect=None)
+    window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))], defect=None, scatter=None)
     return SimpleNamespace(
         ratio=ratio, noise_ratio=10 * ratio, errors=np.array([errors / 2] * 2), model=model, windows=[window],
         fit=SimpleNamespace(offsets="o", cost=errors, values=np.zeros(0)), pieces=[piece], cfg=EffectSolverCfg(),

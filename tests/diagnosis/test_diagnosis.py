@@ -68,8 +68,38 @@ def test_an_effect_whose_intervals_include_no_change_is_said_to_rest_on_the_erro
     wide = replace(friction.parameters[0], low=-0.01)
     for parameters, said in (((wide,), True), ((wide, friction.parameters[0]), False)):
         sentences = diagnosis(effects=(replace(friction, parameters=parameters),)).sentences()
-        sentence = "Each interval of joint_friction includes no change: the fall of the error speaks for it."
+        sentence = (
+            "Each interval of joint_friction includes no change, as errors of nominal values within their tolerance, "
+            "or of the fit, may be as large: the fall of the error speaks for it."
+        )
         assert (sentence in sentences) is said
+
+
+def test_the_headline_claims_no_size_that_the_intervals_leave_open():
+    friction, mass = finding("joint_friction", 0.8), finding("mass", 0.3, step=1)
+    wide = (replace(FRICTION, low=-0.01),)
+    open_friction = replace(friction, parameters=wide)
+    assert diagnosis(effects=(open_friction,)).headline == f"{VERDICTS['effect']}, but not its size"
+    both = diagnosis(effects=(open_friction, mass), groups=(("joint_friction",), ("mass",)))
+    assert both.headline == f"{VERDICTS['effect']}, but not the size of joint_friction"
+    for other in (diagnosis(effects=(friction,)), diagnosis(effects=(open_friction,), verdict="group")):
+        assert other.headline == VERDICTS[other.verdict]
+
+
+def test_parameters_that_may_have_no_change_are_counted_beside_others():
+    stiff = FittedParameter("stiffness[pad]", 1101.2, 1096.1, 1106.4, "N/m", 0.0)
+    none = [FittedParameter(f"{name}[pad]", 0.1, -4.98, 4.8, "N", 0.0) for name in ("preload", "offset")]
+    (said,) = diagnosis(effects=(finding("joint_stiffness", 0.8, parameters=(none[0], stiff, none[1])),)).sentences()
+    assert said.startswith(
+        "Missing: joint_stiffness (stiffness[pad] 1101 [1096, 1106] N/m, 2 more include no change). "
+    )
+    (said,) = diagnosis(effects=(finding("joint_stiffness", 0.8, parameters=(stiff, none[0])),)).sentences()
+    assert "N/m, 1 more includes no change)." in said
+    (said,) = diagnosis(effects=(finding("joint_stiffness", 0.8, parameters=(stiff,) * 6),)).sentences()
+    assert said.count("stiffness[pad]") == 4
+    assert "N/m, 2 more)." in said
+    shown = diagnosis(effects=(finding("joint_stiffness", 0.8, parameters=(stiff,)),))._repr_html_()
+    assert "<td>1101</td><td>1096 to 1106</td>" in shown
 
 
 def test_indistinguishable_effects_are_named_together():
@@ -88,6 +118,39 @@ def test_nothing_found_comes_with_what_would_have_been_seen():
     said = diagnosis(verdict="none_needed", effects=(), ratio=(1.02,)).sentences()
     assert said[0] == "No discrepancy detected: residuals are 1.02 x noise."
     assert "joint_friction torque[hinge] 0.002 N m" in said[1]
+
+
+def test_smallest_sizes_repeat_no_name_and_have_a_unit_or_a_share():
+    found = (
+        Detectable("inertia", "inertia", 0.032, "-", 1.0),
+        Detectable("mass(pusher)", "mass", 0.0021, "-", 1.0),
+        Detectable("sliding_friction", "coefficient", 0.0036, "-", 0.36),
+        Detectable("sensor_gain", "scale[encoder]", 0.02, "-", 0.0),
+        Detectable("length_scale", "scale", 9e-4, "-", 0.0),
+        Detectable("center_of_mass", "z", 2.1e-4, "m", 0.0),
+    )
+    _, said = diagnosis(verdict="none_needed", effects=(), detectable=found).sentences()
+    assert said == (
+        "Smallest detectable sizes (from there on an effect would be noticed, were nothing else wrong; not how exactly "
+        "its size would be known): inertia 3.2 % of the model's; mass(pusher) 0.21 % of the model's; sliding_friction "
+        "coefficient 1 % of the model's; sensor_gain scale[encoder] 0.02 (no unit); length_scale 0.0009 "
+        "(no unit); center_of_mass z 0.00021 m."
+    )
+    assert diagnosis(detectable=found).to_json()["detectable"][2] == {
+        "name": "sliding_friction", "parameter": "coefficient", "size": 0.0036, "unit": "-", "null": 0.36,
+    }  # fmt: skip
+
+
+def test_scatter_that_counts_as_noise_is_said_beside_the_residuals():
+    clause = (
+        "x noise; the scatter of simulated contacts over a time step counts as noise here; `compare` counts it as "
+        "error, and may show more."
+    )
+    for verdict, effects in (("none_needed", ()), ("effect", diagnosis().effects), ("none_of_these", ())):
+        for rests in (True, False):
+            found = diagnosis(verdict=verdict, effects=effects, rests_on_scatter=rests)
+            assert any(s.endswith(clause) for s in found.sentences()) is (rests and verdict != "none_of_these")
+            assert found.to_json()["rests_on_scatter"] is rests
 
 
 def test_what_no_effect_explains_is_reported_with_its_share():
@@ -153,6 +216,21 @@ def test_nominal_values_are_told_as_factors_and_latencies_with_their_unit():
     ]
     assert replace(found, effects=()).changes_model
     assert not replace(found, effects=(), nominal_values=()).changes_model
+
+
+def test_nominal_values_that_did_not_change_are_only_counted():
+    same = FittedParameter("length[arm]", 1.0002, 0.998, 1.003, "-", 1.0)
+    narrow = FittedParameter("gain[arm]", 1.00042, 1.0002, 1.0007, "-", 1.0)
+    late = FittedParameter("delay[angle]", 1e-6, -1e-4, 1e-4, "s", 0.0)
+    lead = "Nominal values were fitted within their tolerances"
+    assert diagnosis(nominal_values=(same, narrow, late)).sentences()[0] == (
+        f"{lead}: gain[arm] x 1.0004 [1.0002, 1.0007]; 2 others did not change visibly."
+    )
+    moved = replace(same, value=0.9991)
+    assert diagnosis(nominal_values=(moved, late)).sentences()[0] == (
+        f"{lead}: length[arm] x 0.999 [0.998, 1.003]; 1 other did not change visibly."
+    )
+    assert diagnosis(nominal_values=(same, late)).sentences()[0] == f"{lead}; none of 2 changed visibly."
 
 
 def test_the_headline_names_effects_beside_what_none_explains():

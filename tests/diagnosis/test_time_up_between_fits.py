@@ -11,7 +11,7 @@ from concent_warp.diagnosis.search import additions, context
 from concent_warp.simulate.time_limit import TimeUpError
 from tests.diagnosis.candidates.made_up_fit import made
 from tests.diagnosis.candidates.test_choices import fits_of, screened
-from tests.diagnosis.made_up import finding, node, procedure
+from tests.diagnosis.made_up import finding, force_is, node, procedure
 
 
 def test_parts_that_there_is_no_time_to_fit_leave_the_fits_of_the_others(monkeypatch):
@@ -53,3 +53,26 @@ def test_an_effect_found_as_the_time_ends_is_added_with_the_errors_of_the_time_s
     assert fitted[-1] is (renewed if in_time else best)
     said = ["Not computed again beside the last effect: what a shorter time step changes."]
     assert search.context.budget.unsettled == ([] if in_time else said)
+
+
+@pytest.mark.parametrize(
+    ("late", "said"),
+    [
+        ("_failures", "Left out: where the model as given fails."),
+        ("_suggested_experiment", "Left out: the next experiment."),
+        ("_replayed", "Left out: a replay in one piece."),
+    ],
+)
+def test_only_what_was_left_out_is_said_to_be(monkeypatch, late, said):
+    force_is(monkeypatch, lambda *_: None)
+
+    def no_time(*_: Any) -> Any:
+        raise TimeUpError
+
+    search = procedure(explain=True)
+    search.record.findings, search.record.groups = [finding("drag", 0.6)], [("drag",)]
+    done: dict[str, Any] = {"_failures": (), "_suggested_experiment": None, "_replayed": None}
+    for name, result in done.items():
+        monkeypatch.setattr(search, name, no_time if name == late else lambda *_, result=result: result)
+    found = search.conclude(node(3.0), [node(3.0), node(1.0, effects=1)], (), [])
+    assert found.unsettled == (said,)

@@ -45,8 +45,39 @@ def test_an_effect_is_named_with_its_gain_interval_p_and_parameter():
     assert "4 % of the error stays unexplained" in text
     assert "torque[hinge] 0.02134 0.0195 to 0.0231 N m" in text
     assert "hinge position, free phase, 1.20-2.50 s, against motion" in text
-    assert "armature 0.0002 kg m^2" in text
+    assert "armature[hinge] 0.0002 kg m^2" in text
     assert "Next experiment" not in text
+
+
+def test_a_size_that_the_intervals_leave_open_is_said_to_be_unknown():
+    bare, known = effect("sensor_gain", 0.6, 0.01), effect("armature", 0.5, 0.01)
+    for null, unknown in ((0.0, False), (0.02, True), (None, False)):
+        bare["parameters"][0]["null"] = null
+        text = _headline({**NAMED, "effects": [bare]})
+        assert ("Its size is not known: each interval includes no change." in text) is unknown
+    bare["parameters"][0] |= {"interval": [0.0195, None], "null": None}  # a limit that may not be there
+    assert "The size of sensor gain is not known" in _headline({**NAMED, "effects": [bare, known]})
+
+
+def test_numbers_of_ordinary_size_have_no_exponent():
+    stiff = effect("joint_stiffness", 0.5, 0.001)
+    stiff["parameters"][0] |= {"value": 23456.7, "interval": [23321.0, 23590.2], "unit": "N/m"}
+    assert "23457 23321 to 23590 N/m" in words_of(diagnosis_section({**NAMED, "effects": [stiff]}))
+
+
+def test_smallest_sizes_say_what_they_mean_and_are_shares_where_they_have_no_unit():
+    limits = [{"name": "inertia", "parameter": "inertia", "size": 0.032, "unit": "-", "null": 1.0}]
+    text = words_of(diagnosis_section({**NAMED, "detectable": limits}))
+    assert "(from there on an effect would be noticed, were nothing else wrong;" in text
+    assert "inertia 3.2 % of the model's" in text
+    assert "inertia inertia" not in text
+
+
+def test_scatter_that_counts_as_noise_is_said_beside_the_residuals():
+    quiet = {"verdict": "none_needed", "ratio": [0.78]}
+    assert "down to their noise." in _headline(quiet)
+    said = _headline({**quiet, "rests_on_scatter": True})
+    assert "residuals are 0.78 x noise; the scatter of simulated contacts over a time step counts as noise" in said
 
 
 def test_what_formulas_leave_is_named_as_their_error():

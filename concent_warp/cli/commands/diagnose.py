@@ -154,11 +154,16 @@ def _say_diagnosis(found: Diagnosis) -> None:
         for k, sentence in enumerate(places[:MOST_PLACES]):
             say(escape(f"{k + 1}. {sentence}"))
     if found.effects:
-        _say_effects(found.effects)
+        _say_effects(found.effects, "best so far" if found.verdict == "unsettled" else "accepted")
 
 
-def _say_effects(effects: Sequence[Finding]) -> None:
-    """Write the table of all effects that were fitted, addition by addition, the best first."""
+def _say_effects(effects: Sequence[Finding], accepted: str) -> None:
+    """Write the table of all effects that were fitted, addition by addition, the best first.
+
+    Args:
+        effects: The effects.
+        accepted: What is said of those that were accepted.
+    """
     from rich.table import Table
 
     table = Table(header_style="bold")
@@ -168,7 +173,7 @@ def _say_effects(effects: Sequence[Finding]) -> None:
     for k, f in enumerate(ranked):
         last = k + 1 == len(ranked) or ranked[k + 1].step != f.step
         first = k == 0 or ranked[k - 1].step != f.step
-        verdict = "accepted" if f.accepted else f.reason
+        verdict = accepted if f.accepted else f.reason
         shown = sorted(f.parameters, key=lambda p: not p.excludes_null)[:MOST_PARAMETERS]
         several = len(f.parameters) > 1
         lines = [f"{f.name}: {verdict}", *(f"  {value_and_interval(p, owner=several)}" for p in shown)]

@@ -12,7 +12,8 @@ from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedM
 from concent_warp.diagnosis.candidates.candidates import label
 from concent_warp.diagnosis.candidates.null_distribution import null_p_value
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
-from concent_warp.diagnosis.result import Detectable, Finding
+from concent_warp.diagnosis.detectable import Detectable
+from concent_warp.diagnosis.result import Finding
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.fit.effects.cross_validation import Sums, bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.intervals import (
@@ -376,5 +377,5 @@ def detectable_size(base: FittedModel, s: ScreenedCandidate, share: float) -> De
         if np.isfinite(p.null) and curvature > 1e-12:
             size = p.scale * np.sqrt(needed / curvature)
             if size < p.high - p.low and (best is None or size / p.scale < best[0]):
-                best = size / p.scale, Detectable(s.effect.name, p.name, float(size), p.unit)
+                best = size / p.scale, Detectable(s.effect.name, p.name, float(size), p.unit, p.null)
     return None if best is None else best[1]

@@ -15,7 +15,7 @@ import numpy as np
 from concent_warp.diagnosis.candidates.baseline import add_candidate, errors_like
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.candidates.evidence import largest_size, leaves_more
-from concent_warp.diagnosis.result import Detectable
+from concent_warp.diagnosis.detectable import Detectable
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking, is_near_noise
 from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.context import SearchContext

@@ -11,6 +11,8 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.estimation.noise import Noise
+from concent_warp.estimation.noise_ratio import noise_ratio
+from concent_warp.fit.effects.observation import NumericalScatter
 from concent_warp.fit.effects.robust import huber, robust_noise_ratio
 
 
@@ -57,6 +59,29 @@ def is_near_noise(base: FittedModel, noise_factors: Mapping[str, float], cfg: Di
     return least_ratio(base, noise_factors) <= cfg.search.explained_ratio
 
 
+def rests_on_scatter(base: FittedModel, cfg: DiagnoseCfg) -> bool:
+    """Return whether residuals are no larger than noise only because numerical scatter counts as such.
+
+    The numerical scatter of simulated contacts counts as noise (`Window.scatter`): a model may explain the data down to
+    both together where it is far above the noise of the instruments. Residuals are those of the fitted initial states.
+
+    Args:
+        base: The fitted model.
+        cfg: Settings.
+    """
+    if all(w.scatter is None for w in base.windows):
+        return False
+    found = []
+    for w, simulated in zip(base.windows, base.fit.linear, strict=True):
+        residual = simulated.residual
+        if w.scatter is not None:
+            residual = w.scatter.unwhitened(residual)
+            residual = residual if w.common is None else NumericalScatter(w.common).whitened(residual)
+        found.append(residual)
+    alone = base.noise_scale * noise_ratio(np.concatenate(found))
+    return bool(base.noise_ratio <= cfg.adequate_ratio < alone)
+
+
 def hidden_by_noise(base: FittedModel, noises: Mapping[str, Noise], cfg: DiagnoseCfg) -> str | None:
     """Return a sentence where what a model explains down to the noise is well above the least noise that may be.
 
@@ -78,7 +103,9 @@ def hidden_by_noise(base: FittedModel, noises: Mapping[str, Noise], cfg: Diagnos
 
 
 def qualified_by_noise(found: Diagnosis, base: FittedModel, noises: Mapping[str, Noise], cfg: DiagnoseCfg) -> Diagnosis:
-    """Return a diagnosis that says where what is missing may be hidden by the noise, see `hidden_by_noise`.
+    """Return a diagnosis that says where what is missing may be hidden by the noise.
+
+    By noise that is too uncertain (`hidden_by_noise`), or by the scatter of simulations (`rests_on_scatter`).
 
     Where a replay in one piece is far off as well, no effect is named: neither windows nor replay speak for one.
 
@@ -88,6 +115,8 @@ def qualified_by_noise(found: Diagnosis, base: FittedModel, noises: Mapping[str,
         noises: Noise of each channel that is not stated.
         cfg: Settings.
     """
+    if rests_on_scatter(base, cfg):
+        found = replace(found, rests_on_scatter=True)
     hidden = hidden_by_noise(base, noises, cfg)
     if hidden is None or found.verdict not in ("none_needed", "effect", "group"):
         return found

@@ -30,7 +30,8 @@ from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
 from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.candidates.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.result import Detectable, Finding
+from concent_warp.diagnosis.detectable import Detectable
+from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.adequacy import is_adequate, is_near_noise, least_ratio
 from concent_warp.diagnosis.search.beside_nominal import BesideNominalValues
 from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext

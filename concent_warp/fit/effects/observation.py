@@ -111,6 +111,12 @@ class NumericalScatter:
         residual = residual * self._shares
         return residual + directions @ ((1 / np.sqrt(1 + variance) - 1) * (directions.T @ residual))
 
+    def unwhitened(self, residual: np.ndarray) -> np.ndarray:
+        """Return residuals (count,) in units of noise from those in units of noise and scatter: `whitened` undone."""
+        directions, variance = self._directions
+        residual = residual + directions @ ((np.sqrt(1 + variance) - 1) * (directions.T @ residual))
+        return residual / self._shares
+
     def rows(self, chosen: np.ndarray) -> NumericalScatter:
         """Return the scatter of some of the residuals, by their indices."""
         return NumericalScatter(self.deviations[chosen], None if self.own is None else self.own[chosen])

@@ -212,3 +212,10 @@ def test_what_presses_an_overlap_at_the_start_apart_is_no_scatter():
     readings = tuple(replace(r, value=0 * r.value) for r in sunk.readings)
     (found,) = with_scatter(model, [replace(sunk, readings=readings)], cfg=AT_GRID)
     assert np.abs(scatter_of(found).deviations).max() < 0.5  # several times as much with the acceleration
+
+
+def test_whitening_by_scatter_can_be_undone():
+    rng = np.random.default_rng(2)
+    residual, deviations = rng.normal(size=9), 5 * rng.normal(size=(9, 3))
+    for scatter in (NumericalScatter(deviations), NumericalScatter(deviations, np.abs(rng.normal(size=9)))):
+        np.testing.assert_allclose(scatter.unwhitened(scatter.whitened(residual)), residual, rtol=1e-9)
