@@ -99,7 +99,8 @@ def test_loads_in_a_point_are_those_of_links_that_turn():
         world(BALL).add(Mass("thing", "point"))
     assert Mass("lower", "point").has_as_special_case(Mass("lower"))
     assert not Mass("lower").has_as_special_case(Mass("lower", "point"))
-    assert not Mass("lower", "point").has_as_special_case(Mass("upper"))
+    assert Mass("lower", "point").has_as_special_case(Mass("tool"))
+    assert not Mass("lower", "point").has_as_special_case(Mass("upper", "point"))
 
 
 @pytest.mark.parametrize("factor", [0.5, 3.0])

@@ -69,8 +69,11 @@ class Mass(BodyEffect):
     parts = (POINT,)
 
     def has_as_special_case(self, other: Effect) -> bool:
-        """Return whether another mass of the same body is the model's times a factor, where this one is in a point."""
-        return bool(self.part) and isinstance(other, Mass) and not other.part and other.elements == self.elements
+        """Return whether another effect is a factor of a mass, where this one is a mass in a point.
+
+        Also of another body: a tool and the link that carries it move as one.
+        """
+        return bool(self.part) and isinstance(other, Mass) and not other.part
 
     @classmethod
     def single_targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
