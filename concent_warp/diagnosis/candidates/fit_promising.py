@@ -85,6 +85,7 @@ class CandidateFits:
         self._polish_near(best, expected)
         expected = np.maximum(expected, [c.share(self.base) for c in self.fits])
         self.refit_rivals(expected)
+        self._fit_confusions(screened)
         if self._restart_left_behind():
             self.refit_rivals(np.array([c.share(self.base) for c in self.fits]))
         if self._best().ratio > self.cfg.adequate_ratio and self._left() > self.cfg.unknown_force.min_share:
@@ -242,6 +243,26 @@ class CandidateFits:
         self._restart(lagging, best, quick=True)
         for k in lagging:
             expected[k] = max(expected[k], self.fits[k].share(self.base))
+
+    def _fit_confusions(self, screened: Sequence[ScreenedCandidate]) -> None:
+        """Fit what a best one that leaves only noise is confused with, however little it promised.
+
+        Promises are linear in initial states that contacts make rough: an effect that moves the same as the best, and
+        of which a screening saw nothing, must not be missing from the group.
+        """
+        best, search = self._best(), self.search
+        if best.ratio >= search.explained_ratio or best.share(self.base) < self.cfg.min_gain:
+            return
+        known = {id(s) for s in (*self.fitted, *self.left)}
+        rivals = [s for s in screened if id(s) not in known and _are_confused(s.effect, best.effect)]
+        rivals = _a_few_of_each([s for s in rivals if not s.effect.is_part], search.fits_of_each)
+        tasks = [(self.base, s) for s in rivals]
+        for s, c in zip(rivals, self.runner.run_in_time(fit_candidate, tasks, "fitting confusions"), strict=True):
+            if c is None:
+                self.left.append(s)
+            else:
+                self.fitted.append(s)
+                self.fits.append(c)
 
     def _restart_left_behind(self) -> bool:
         """Restart candidates far behind a best one that leaves only noise from its initial states.
