@@ -77,9 +77,10 @@ def test_the_equations_are_those_of_the_model_without_the_load(monkeypatch):
     monkeypatch.setitem(globals(), "LOAD", 0.0)
     m = mujoco.MjModel.from_xml_string(ARM)
     d = mujoco.MjData(m)
-    d.qpos, d.qvel, d.ctrl = [0.4, -0.7], [0.8, -1.1], [0.2, 0.5]
+    state = q, v, u = np.array([0.4, -0.7]), np.array([0.8, -1.1]), np.array([0.2, 0.5])
+    d.qpos[:], d.qvel[:], d.ctrl[:] = state
     mujoco.mj_forward(m, d)
-    expected = accelerations(d.qpos, d.qvel, d.ctrl)
+    expected = accelerations(q, v, u)
     np.testing.assert_allclose(d.qacc, expected, rtol=1e-6)
 
 
