@@ -9,7 +9,7 @@ import pytest
 from concent_warp.effects.effect import Effect, Parameter, variant_fields
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.library.drives import GAINS
-from concent_warp.effects.library.objects import AXES
+from concent_warp.effects.library.objects import AXES, POINT
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import EngineError
 from concent_warp.model import Model
@@ -37,6 +37,7 @@ SCENE = """
     <geom type="box" size="0.05 0.04 0.02" mass="0.3" friction="0.2" solref="0.01 1"/></body>
   <body name="ball" pos="1 0 0.0299"><freejoint/><geom type="sphere" size="0.03" mass="0.1" condim="6"/></body>
 </worldbody>
+<tendon><fixed name="band" stiffness="0.4" damping="0.01"><joint joint="elbow" coef="1"/></fixed></tendon>
 <actuator><position name="shoulder" joint="shoulder" kp="4" kv="0.05"/>
   <position name="elbow" joint="elbow" kp="2" kv="0.02"/><position name="lift" joint="lift" kp="500" kv="20"/>
   <motor name="left" joint="left"/><motor name="right" joint="right"/></actuator>
@@ -134,6 +135,10 @@ def test_air_changes_the_motion_alike_on_both_engines():
 @pytest.mark.parametrize("part", AXES)
 def test_single_moments_of_inertia_change_the_motion_alike_on_both_engines(part):
     assert_parity(*all_at_once("cpu", ("inertia",), part))
+
+
+def test_loads_in_a_point_change_the_motion_alike_on_both_engines():
+    assert_parity(*all_at_once("cpu", ("mass",), POINT))
 
 
 @pytest.mark.parametrize("part", GAINS)
