@@ -144,7 +144,7 @@ class Model:
 
         Args:
             name: Name of the effect; `concent_warp.effect_classes()` lists them.
-            target: Joints, actuators, bodies or sensors that it acts on; by default all that it may act on.
+            target: Joints, tendons, actuators, bodies or sensors that it acts on; by default all that it may act on.
             values: Values of its parameters by name, such as ``{"torque[joint1]": 0.1}``; those not named keep the
                 null value, at which the effect does nothing.
 

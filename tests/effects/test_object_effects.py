@@ -76,6 +76,11 @@ def test_a_load_in_a_point_is_a_small_heavy_body_there():
     np.testing.assert_allclose(move(weighed, 1.0, qpos=start).qpos, without.qpos, atol=1e-6)
 
 
+def test_several_links_may_carry_the_same_load_in_a_point():
+    m = world(ARM.format(load="")).add(Mass("upper", "lower", "point"), [0.3, 0.2, 0.0, 0.0]).compile()
+    np.testing.assert_allclose(m.body_mass[1:], [0.8 + 0.3, 0.4 + 0.3])
+
+
 def test_what_a_mass_that_is_taken_away_leaves_may_be_a_body():
     plain = world(ARM.format(load=""))
     before = plain.compile()

@@ -38,7 +38,7 @@ class Arguments:
     model: Path | None = None
     """Model (.toml) or MJCF (.xml)."""
     target: tuple[str, ...] = ()
-    """Joints, actuators, bodies or sensors that it acts on; by default all that it may act on."""
+    """Joints, tendons, actuators, bodies or sensors that it acts on; by default all that it may act on."""
     set: tuple[str, ...] = ()
     """Values of parameters, such as torque[joint1]=0.1; with --fit the values to start from."""
     fit: Path | None = None

@@ -22,7 +22,7 @@ from concent_warp.effects.select import (
 POINT = "point"
 """Second target of a mass that is in a point of the body."""
 LOAD_SHARE = 0.1
-"""Share of the mass of a robot of which a load is at least that its last link may carry unknown to the model [-]."""
+"""Typical load on a link that is light, unknown to the model, over the mass of the robot [-]."""
 LEAST_MOMENT = 0.05
 """Least moment of inertia of a body from which a mass was taken, over the least of the model's [-]."""
 EACH_AXIS = "axes"
@@ -114,7 +114,8 @@ class Mass(BodyEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Scale both, or add the point; a drive goes on compensating the weight that it knows."""
         if self.part:
-            _add_point(m, self.ids(m)[0], float(values[0]), values[1:])
+            for body in self.ids(m):
+                _add_point(m, int(body), float(values[0]), values[1:])
             return
         m.body_mass[self.ids(m)] *= values[0]
         m.body_inertia[self.ids(m)] *= values[0]

@@ -8,17 +8,15 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.library.joints import MUJOCO
+from concent_warp.effects.library.joints import MUJOCO, USUAL_SHARE
 from concent_warp.effects.select import element_name
 
-USUAL = 0.3
-"""Typical difference of a stiffness or damping from the model's, relative to it [-]."""
 SCANNED = (0.5, 0.7, 1.4, 2.0)
 """Stiffnesses that are tried, over the model's [-]: what swings on a spring soon is in another phase."""
 USUAL_LENGTH = 0.05
-"""The same of a rest length [-]."""
+"""Typical difference of a rest length from the model's, relative to it [-]."""
 LEAST_LENGTH = 0.01
-"""Least typical difference of a rest length [m or rad]."""
+"""Least such difference [m or rad]."""
 
 
 class TendonEffect(Effect):
@@ -65,7 +63,7 @@ class TendonStiffness(TendonEffect):
         for n, (_, unit), k, _ in rows:
             k = float(k)
             scan = tuple(k * factor for factor in SCANNED)
-            stiffnesses.append(Parameter(f"stiffness[{n}]", unit, k, 0.0, 10 * k, USUAL * k, scan=scan))
+            stiffnesses.append(Parameter(f"stiffness[{n}]", unit, k, 0.0, 10 * k, USUAL_SHARE * k, scan=scan))
         lengths = []
         for n, (unit, _), _, length in rows:
             usual = max(USUAL_LENGTH * abs(float(length)), LEAST_LENGTH)
@@ -102,7 +100,7 @@ class TendonDamping(TendonEffect):
         found = []
         for n, t, (_, unit) in zip(self.target, self.ids(m), self.units(m), strict=True):
             null, usual = float(m.tendon_damping[t]), 0.01 * float(m.tendon_stiffness[t])
-            scale = max(USUAL * null, usual)
+            scale = max(USUAL_SHARE * null, usual)
             unit = unit.replace("N m/", "N m s/").replace("N/", "N s/")
             found.append(Parameter(f"damping[{n}]", unit, null, 0.0, max(10 * null, 30 * scale), scale))
         return tuple(found)
