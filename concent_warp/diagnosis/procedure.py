@@ -39,7 +39,7 @@ from concent_warp.diagnosis.search.context import (
 )
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import error_of_own_friction, said_of_own_friction
-from concent_warp.diagnosis.search.impact_errors import stand, with_errors_of_impacts
+from concent_warp.diagnosis.search.impact_errors import said_of_impacts, stand, with_errors_of_impacts
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
 from concent_warp.diagnosis.search.time_step import (
@@ -395,6 +395,11 @@ class Procedure:
                 None,
                 "Open: whether a force of unknown form explains more.",
             )
+        if unknown is not None and unknown.varies and context.explains(begun, begun, added=False):
+            # What changes from window to window, where the model as given leaves no more than noise, is no effect.
+            record.refuse(lambda _: True, "its value changes from window to window, and noise explains the data as well")
+            record.keep_groups(0)
+            return self.conclude(given, self.revision.restore_given([begun], given), detectable, issues)
         verdict: Verdict = "none_needed"
         lacking = unknown is not None and not unknown.form_error
         if lacking and not added:
@@ -432,7 +437,11 @@ class Procedure:
             ratio=(given.noise_ratio, *(one.noise_ratio for one in after)),
             detectable=detectable,
             next_experiment=experiment,
-            issues=(*issues, *self._said_of_impacts(), *said_of_own_friction(own_error)),
+            issues=(
+                *issues,
+                *(said_of_impacts(cfg.search.impact_error) if self.impacts_left else ()),
+                *said_of_own_friction(own_error),
+            ),
             models=(given.delivered, *(one.delivered for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
@@ -458,15 +467,6 @@ class Procedure:
         return self.context.budget.attempt(
             error, None, "Open: whether what is left is an error of the model's friction."
         )
-
-    def _said_of_impacts(self) -> tuple[str, ...]:
-        """Return a sentence on what the answer leaves of impacts, none where it leaves nothing."""
-        error = self.context.cfg.search.impact_error
-        said = (
-            f"What follows impacts is explained only within an error of {100 * error:g} % of the change of velocity in "
-            "each, which laws of contact leave open: `compare` shows it."
-        )
-        return (said,) if self.impacts_left else ()
 
     def _suggested_experiment(self) -> SuggestedExperiment | None:
         """Return the experiment that distinguishes the first group of effects, None where there is no such group."""

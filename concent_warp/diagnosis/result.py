@@ -122,6 +122,8 @@ class UnknownForceFound:
     all effects."""
     form_error: bool = False
     """Whether it explains so little of the discrepancy that it is an error of the form of the accepted effects."""
+    varies: bool = False
+    """Whether it is no force but an effect that has another value in each window."""
 
     @property
     def sentence(self) -> str:
@@ -146,6 +148,7 @@ class UnknownForceFound:
             "share": self.share,
             "instead": self.instead,
             "form_error": self.form_error,
+            "varies": self.varies,
         }
 
 

@@ -9,6 +9,7 @@ from concent_warp.comparison.compare import CompareCfg, compare
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.replayed import Replayed, replayed
+from concent_warp.diagnosis.result import UnknownForceFound
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -94,3 +95,23 @@ def test_what_is_not_named_is_saved_only_where_it_follows_the_recording_better(
     monkeypatch.setattr(made, "_replayed", lambda *_: pytest.fail("replayed"))
     given = node(1.0)
     assert made.conclude(given, [given], (), ()).explains
+
+
+@pytest.mark.parametrize(
+    ("ratio", "varies", "verdict"),
+    [(1.0, True, "none_needed"), (1.0, False, "none_of_these"), (3.0, True, "none_of_these")],
+)
+def test_a_value_that_changes_from_window_to_window_is_no_effect_where_noise_explains_the_data(
+    monkeypatch, ratio, varies, verdict
+):
+    made, given, last = procedure(), node(ratio), node(0.9, effects=1)
+    made.record.findings, made.record.groups = [finding("mass", 0.14)], [("mass",)]
+    found = UnknownForceFound("mass with another value in each window", 0.1, 0.001, 0.5, varies=varies)
+    monkeypatch.setattr("concent_warp.diagnosis.procedure.beyond_effects", lambda *_, **__: found)
+    monkeypatch.setattr(made, "_replayed", lambda *_: None)
+    said = made.conclude(given, [given, last], (), ())
+    assert said.verdict == verdict
+    assert said.groups == (() if verdict == "none_needed" else (("mass",),))
+    assert [f.accepted for f in said.effects] == [verdict != "none_needed"]
+    assert (said.unknown_force is None) == (verdict == "none_needed")
+    assert len(said.models) == (1 if verdict == "none_needed" else 2)

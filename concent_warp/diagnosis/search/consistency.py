@@ -107,7 +107,7 @@ def _variation_found(first: FittedModel, one: FittedModel, effect: int, cfg: Dia
     share = one.noise_scale**2 * more.excess / rows / lacked
     least = cfg.small_form_error if kind.exact else cfg.unknown_force.min_share
     words = f"{kind.name} with another value in each window"
-    return None if share < least else UnknownForceFound(words, more.gain, more.p, min(share, 1.0))
+    return None if share < least else UnknownForceFound(words, more.gain, more.p, min(share, 1.0), varies=True)
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,18 @@ class Refit(Protocol):
         ...
 
 
+def said_of_impacts(error: float) -> tuple[str]:
+    """Return a sentence on what an answer leaves of impacts.
+
+    Args:
+        error: Error of a law of contact over the change of velocity in each impact [-].
+    """
+    return (
+        f"What follows impacts is explained only within an error of {100 * error:g} % of the change of velocity in "
+        "each, which laws of contact leave open: `compare` shows it.",
+    )
+
+
 def stand(
     rough: FittedModel, refitted: FittedModel, count: int, noise_factors: Mapping[str, float], cfg: DiagnoseCfg
 ) -> list[bool]:
