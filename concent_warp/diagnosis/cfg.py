@@ -287,6 +287,9 @@ class TimeStepCfg:
     max_share_of_contact: Positive = 0.2
     """Longest such step over the shortest time constant of the model's contacts [-]: MuJoCo's contacts are no stiffer
     than two steps, and candidates may be up to twice and a half as stiff as the model."""
+    steps_of_impact: Count = 30
+    """Steps that the shortest impact of a body in flight takes with a step that resolves it, if `max_division` allows:
+    the phase of its beginning then matters by a few per cent."""
     decisive_gain: Share = 0.9
     """Share of the error that a shorter step must remove to be used before effects are looked for [-]: an effect that
     removes more still is more likely to stand in for the step and a part of what else is missing. Empirical."""
@@ -306,6 +309,9 @@ class NominalCfg:
     promised_share: Share = 0.5
     """Share of the least gain that a linear step must promise, or the values are not fitted [-]: within the tolerance
     residuals are in proportion to the values, right to a factor of 2."""
+    decisive_gain: Share = 0.5
+    """Share of the held-out error that they must remove to be tried before effects where a model is far off [-]: errors
+    of all of them together may be large beside the noise of good instruments."""
     bounded_ratio: Positive = 1.1
     """Noise ratio up to which a fit with values at their bounds counts [-]; where more is left, something larger than a
     tolerance is missing. That of `SearchCfg.explained_ratio`."""

@@ -120,7 +120,7 @@ class Procedure:
         revision = self.revision
         runner.enter(ADDITIONS_DONE, REVISION_DONE)
         fitted = revision.restore_given(revision.simplified(fitted), given)
-        fitted = revision.final_values(revision.profiled(fitted))
+        fitted = revision.final_values(revision.with_resolved_impacts(revision.profiled(fitted)))
         found = qualified_by_noise(self.conclude(given, fitted, detectable, issues), fitted[-1], noises, cfg)
         runner.progress(1.0, "done")
         return found
@@ -220,8 +220,10 @@ class Procedure:
         """Return the model as given and after each addition, and the detectable sizes of all effects."""
         budget, add_effects = self.context.budget, self.additions.add_effects
         attempt, detectable, fitted = budget.attempt, (), [given]
+        if given.ratio > self.context.cfg.search.far_ratio:
+            fitted = [self.additions.within_tolerances(given) or given]
         far = "Open: how far the model as given is off over short windows."
-        if (coarse := attempt(lambda: self.coarse_baseline(given), None, far)) is not None:
+        if fitted[0] is given and (coarse := attempt(lambda: self.coarse_baseline(given), None, far)) is not None:
             found, detectable = add_effects([coarse], detectable, effects_alone=True)
             fitted = attempt(
                 lambda: self.carry_over(given, found),

@@ -189,7 +189,7 @@ class HoldingFriction:
 
 @dataclass(frozen=True)
 class FinerTimeStep:
-    """A shorter time step with which the model explains more, before any effect."""
+    """A shorter time step with which the model explains more, before any effect or of impacts beside one of contacts."""
 
     given: float
     """Time step of the model as given [s]."""
@@ -206,15 +206,27 @@ class FinerTimeStep:
 
     too_long: bool = False
     """Whether the error that the used step still has may be all that is left, so that nothing can be said."""
+    impacts: bool = False
+    """Whether it is for impacts alone: `change` is then the scatter of predictions by when between two steps they begin,
+    and `gain` the share of that which it removes."""
 
     @property
     def error(self) -> float:
         """Error of the predictions that the used step still has over the noise [-]: in proportion to the step."""
+        if self.impacts:
+            return self.change * (1 - self.gain)
         return self.change / max(self.given / self.used - 1, 1e-12)
 
     @property
     def sentence(self) -> str:
         """A sentence on the time step."""
+        if self.impacts:
+            return (
+                f"The model's time step of {1e3 * self.given:.3g} ms is too long for its impacts: when between two steps "
+                f"they begin scatters its predictions by {_times(self.change)} x noise (rms), with "
+                f"{1e3 * self.used:.3g} ms by {_times(self.error)} x. Constants of contacts are those of that step, which "
+                "a saved model has."
+            )
         said = (
             f"The model's time step of {1e3 * self.given:.3g} ms is too long for these data: with "
             f"{1e3 * self.used:.3g} ms its predictions change by {_times(self.change)} x noise, and the held-out error "
@@ -231,7 +243,7 @@ class FinerTimeStep:
         """Return the time step in plain types."""
         gain = {"value": self.gain, "interval": [self.low, self.high]}
         return {"given": self.given, "used": self.used, "change": self.change, "gain": gain,
-                "error": self.error, "too_long": self.too_long}  # fmt: skip
+                "error": self.error, "too_long": self.too_long, "impacts": self.impacts}  # fmt: skip
 
 
 @dataclass(frozen=True)

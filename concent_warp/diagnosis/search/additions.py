@@ -26,6 +26,7 @@ from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_val
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import finer_time_step, renew_defects
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
+from concent_warp.fit.effects.observe import has_touchable_free_body
 from concent_warp.simulate.time_limit import TimeUpError
 
 
@@ -274,7 +275,13 @@ class Additions:
         return None if plain is None else [*fitted[:-1], plain]
 
     def _nominal(
-        self, one: FittedModel, enough: Callable[[FittedModel], bool], *, dependent: bool, with_step: bool = False
+        self,
+        one: FittedModel,
+        enough: Callable[[FittedModel], bool],
+        *,
+        dependent: bool,
+        with_step: bool = False,
+        least: float | None = None,
     ) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
 
@@ -286,9 +293,10 @@ class Additions:
             enough: Whether a model with values at their bounds leaves little enough.
             dependent: See `with_nominal_values`.
             with_step: Whether to try a shorter time step beside them.
+            least: Share of the held-out error that they must remove [-]; by default that of an effect.
         """
         context, holding = self.context, self.context.record.holding
-        found = context.nominal_fit(one, dependent=dependent)
+        found = context.nominal_fit(one, dependent=dependent, least=least)
         if found is None:
             return None
         held = self.with_holding(found)
@@ -299,6 +307,33 @@ class Additions:
             return self._adopt([held], finer)[-1]
         context.record.holding = holding
         return found if stays_within(found, context.cfg.nominal, enough) else None
+
+    def within_tolerances(self, given: FittedModel) -> FittedModel | None:
+        """Return the model as given with constants within their tolerance where that leaves no more than noise.
+
+        Nominal values, friction that holds, and a shorter time step where the model needs one. Where a model is far off
+        effects are looked for over short windows, without these, and would stand in for them. None where they leave
+        more.
+
+        Args:
+            given: The model as given, over windows as long as the motion allows.
+        """
+        context, cfg = self.context, self.context.cfg
+        if not cfg.nominal.enabled or has_touchable_free_body(given.model.compile()):
+            return None
+        before, unsettled = context.record.copy(), "Open: whether nominal values alone explain the data."
+
+        def attempt() -> FittedModel | None:
+            """Return the model where nominal values take away most of what is left."""
+            enough, least = partial(context.is_little, first=given), cfg.nominal.decisive_gain
+            return self._nominal(self.with_holding(given), enough, dependent=True, with_step=True, least=least)
+
+        found = context.budget.attempt(attempt, None, unsettled)
+        if found is None or is_lacking(found, context.noise_factors, cfg):
+            context.record = before
+            return None
+        context.record.held_first = len(context.record.holding)
+        return found
 
     def _needs_step(self, plain: FittedModel, finer: FittedModel) -> bool:
         """Return whether a model explains more with a shorter time step, which nominal values may stand in for."""

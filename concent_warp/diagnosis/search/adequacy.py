@@ -12,7 +12,6 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.estimation.noise import Noise
 from concent_warp.estimation.noise_ratio import noise_ratio
-from concent_warp.fit.effects.observation import NumericalScatter
 from concent_warp.fit.effects.robust import huber, robust_noise_ratio
 
 
@@ -71,13 +70,7 @@ def rests_on_scatter(base: FittedModel, cfg: DiagnoseCfg) -> bool:
     """
     if all(w.scatter is None for w in base.windows):
         return False
-    found = []
-    for w, simulated in zip(base.windows, base.fit.linear, strict=True):
-        residual = simulated.residual
-        if w.scatter is not None:
-            residual = w.scatter.unwhitened(residual)
-            residual = residual if w.common is None else NumericalScatter(w.common).whitened(residual)
-        found.append(residual)
+    found = [w.without_scatter(one.residual) for w, one in zip(base.windows, base.fit.linear, strict=True)]
     alone = base.noise_scale * noise_ratio(np.concatenate(found))
     return bool(base.noise_ratio <= cfg.adequate_ratio < alone)
 

@@ -155,12 +155,15 @@ class SearchContext:
         found = self.nominal_fit(one)
         return found if found is not None and stays_within(found, self.cfg.nominal) else None
 
-    def nominal_fit(self, one: FittedModel, *, dependent: bool = False) -> FittedModel | None:
+    def nominal_fit(
+        self, one: FittedModel, *, dependent: bool = False, least: float | None = None
+    ) -> FittedModel | None:
         """Return a fitted model with nominal values up to their bounds, None where that explains nothing more.
 
         Args:
             one: The fitted model.
             dependent: See `with_nominal_values`.
+            least: Share of the held-out error that they must remove [-]; by default that of an effect.
         """
         if not self.cfg.nominal.enabled or nominal_effects(one.model):
             return None
@@ -169,7 +172,7 @@ class SearchContext:
         beside = self.beside_nominal(one)
         if beside is None:
             return None
-        least = self.least_gain(one)
+        least = self.least_gain(one) if least is None else least
         fit = partial(with_nominal_values, one, self.cfg.nominal, least, beside.sensitivities, dependent)
         return self.budget.attempt(fit, None, unsettled)
 

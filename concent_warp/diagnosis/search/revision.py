@@ -24,6 +24,7 @@ from concent_warp.diagnosis.candidates.evidence import AT_NULL, profile_widening
 from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.search.context import PROFILES_DONE, REVISION_DONE, VALUES_DONE, SearchContext
 from concent_warp.diagnosis.search.holding import with_scene
+from concent_warp.diagnosis.search.impact_step import resolved_impacts
 from concent_warp.diagnosis.search.joint_fit import (
     established_effects,
     joint_finding,
@@ -174,6 +175,21 @@ class Revision:
             context.progress("restoring nominal values")
             refit = partial(without_nominal_values, last)
             last = self._if_as_good(last, refit, sentence.format("other nominal values are needed"))
+        return [*fitted[:-1], last]
+
+    def with_resolved_impacts(self, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models, the last with a time step that resolves impacts where constants of contacts rest on
+        them.
+        """
+        context, record = self.context, self.context.record
+        if record.time_step is not None or all(f.family != "contact" for f in record.accepted()):
+            return fitted
+        context.progress("shortening the time step for impacts")
+        unsettled = "Open: whether a shorter time step changes the constants of contacts."
+        found = context.budget.attempt(lambda: resolved_impacts(fitted[-1], context.cfg), None, unsettled)
+        if found is None:
+            return fitted
+        last, record.time_step = found
         return [*fitted[:-1], last]
 
     def _is_lacking(self, one: FittedModel) -> bool:

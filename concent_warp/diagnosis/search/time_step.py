@@ -47,7 +47,7 @@ def longer_time_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel:
     for factor in range(cfg.max_lengthening, 1, -1):
         if factor * given > (1 + 1e-9) * longest:
             continue
-        longer = _with_time_step(base, factor * given)
+        longer = with_time_step(base, factor * given)
         if _change(base, longer) <= most:
             return _with_defects(longer, given)
     return base
@@ -123,7 +123,7 @@ def _at_states_of_shorter_step(one: FittedModel, cfg: TimeStepCfg) -> FittedMode
     if not lost:
         return None
     plain = without_defects(one)
-    finer = _with_time_step(plain, one.timestep)
+    finer = with_time_step(plain, one.timestep)
     solver, measured = finer.solver(), [np.zeros_like(o) for o in one.fit.offsets]
     there = replace(one.fit, offsets=tuple(measured))
     left, before = ([np.sum(r**2) for r in _projected(one, _residuals(replace(m, fit=there)))] for m in (finer, plain))
@@ -197,7 +197,7 @@ def without_defects(one: FittedModel) -> FittedModel:
 def _with_defects(one: FittedModel, timestep: float) -> FittedModel:
     """Return a model with the defects of its motion against a shorter time step [s]; not fitted again."""
     plain = without_defects(one)
-    pairs = zip(plain.windows, _residuals(_with_time_step(plain, timestep)), _residuals(plain), strict=True)
+    pairs = zip(plain.windows, _residuals(with_time_step(plain, timestep)), _residuals(plain), strict=True)
     return replace(one, windows=tuple(replace(w, defect=TimeStepDefect(timestep, a - b)) for w, a, b in pairs))
 
 
@@ -228,7 +228,7 @@ def projected_residuals(base: FittedModel, other: FittedModel) -> list[np.ndarra
 
 def _division(base: FittedModel, cfg: TimeStepCfg) -> int:
     """Return into how many parts to divide the time step, so that its error is small beside the noise."""
-    error = 2 * _change(base, _with_time_step(without_defects(base), base.timestep / 2))
+    error = 2 * _change(base, with_time_step(without_defects(base), base.timestep / 2))
     if not np.isfinite(error):
         return 1
     return int(np.clip(np.ceil(error / cfg.max_error), 1, cfg.max_division))
@@ -258,7 +258,7 @@ def _longest_step(base: FittedModel, cfg: TimeStepCfg) -> float:
     return cfg.max_share_of_contact * float(constants[constants > 0].min(initial=np.inf))
 
 
-def _with_time_step(base: FittedModel, timestep: float) -> FittedModel:
+def with_time_step(base: FittedModel, timestep: float) -> FittedModel:
     """Return the model with another time step, its residuals as they were."""
     scene = base.model.scene.with_timestep(timestep)
     return replace(base, model=replace(base.model, scene=scene))

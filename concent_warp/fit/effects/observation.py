@@ -121,6 +121,16 @@ class NumericalScatter:
         """Return the scatter of some of the residuals, by their indices."""
         return NumericalScatter(self.deviations[chosen], None if self.own is None else self.own[chosen])
 
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the covariance of noise and scatter [-]."""
+        return float(np.log1p(self._directions[1]).sum() - 2 * np.log(self._shares).sum())
+
+    @property
+    def square(self) -> float:
+        """Sum of the variances by which residuals scatter [-]."""
+        return float((self.deviations**2).sum() + (0.0 if self.own is None else (self.own**2).sum()))
+
     @cached_property
     def _shares(self) -> np.ndarray:
         """Noise of each residual over noise and what it has for itself, shape (count,)."""
@@ -168,6 +178,13 @@ class Window:
     common: np.ndarray | None = field(default=None, repr=False)
     """Changes of the residuals per standard deviation of errors that all samples of a channel share (`Channel.common`),
     shape (count, m); None for none."""
+
+    def without_scatter(self, residual: np.ndarray) -> np.ndarray:
+        """Return residuals (count,) in units of noise alone from those in which numerical scatter counts as noise."""
+        if self.scatter is None:
+            return residual
+        residual = self.scatter.unwhitened(residual)
+        return residual if self.common is None else NumericalScatter(self.common).whitened(residual)
 
 
 def first_part(w: Window, length: float) -> Window:
