@@ -309,7 +309,7 @@ class Additions:
         return found if stays_within(found, context.cfg.nominal, enough) else None
 
     def within_tolerances(self, given: FittedModel) -> FittedModel | None:
-        """Return the model as given with constants within their tolerance where that leaves no more than noise.
+        """Return the model as given with constants within their tolerance where that leaves next to nothing.
 
         Nominal values, friction that holds, and a shorter time step where the model needs one. Where a model is far off
         effects are looked for over short windows, without these, and would stand in for them. None where they leave
@@ -326,10 +326,14 @@ class Additions:
         def attempt() -> FittedModel | None:
             """Return the model where nominal values take away most of what is left."""
             enough, least = partial(context.is_little, first=given), cfg.nominal.decisive_gain
-            return self._nominal(self.with_holding(given), enough, dependent=True, with_step=True, least=least)
+            found = self._nominal(self.with_holding(given), enough, dependent=True, with_step=True, least=least)
+            if found is None or not is_lacking(found, context.noise_factors, cfg):
+                return found
+            finer = self._finer(found)
+            return found if finer is None else self._adopt([found], finer)[-1]
 
         found = context.budget.attempt(attempt, None, unsettled)
-        if found is None or is_lacking(found, context.noise_factors, cfg):
+        if found is None or (is_lacking(found, context.noise_factors, cfg) and not context.is_little(found, given)):
             context.record = before
             return None
         context.record.held_first = len(context.record.holding)
