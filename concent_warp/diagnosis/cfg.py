@@ -102,6 +102,9 @@ class SearchCfg:
     """Share of the held-out error that a shorter time step, or nominal values within their tolerance, must remove while
     more than `DiagnoseCfg.form_error_ratio` is left [-]; where they remove less, an effect is looked for first, and
     they are tried again beside it. Empirical."""
+    alone_share: float = 1 / 3
+    """Share of what the best of the others leaves beyond the noise, below which an effect counts that counts only where
+    it explains the data alone (`Effect.is_alone`) [-]. Empirical."""
     explained_ratio: float = 1.1
     """Noise ratio below which a fitted candidate leaves little to others [-]. Empirical."""
     noise_level_ratio: float = 1.03

@@ -85,6 +85,8 @@ class Parameter:
     typical: float = 0.0
     """The same in the odds between effects that explain as much, where it is more than `scale`: what experience expects
     may be more than a step over which motion is linear."""
+    is_side: bool = False
+    """Whether it is no size of the effect but a choice within its formula, whose bounds say nothing of what is missing."""
 
 
 class Effect:

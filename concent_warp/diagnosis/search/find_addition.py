@@ -328,5 +328,10 @@ class AdditionFinder:
 
 
 def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:
-    """Return candidates less those that count only where they explain the data alone, and leave more than they may."""
-    return [c for c in fitted if not c.effect.is_alone or c.ratio <= cfg.form_error_ratio]
+    """Return candidates less those that count only where they explain the data alone, and leave more than they may.
+
+    One of these that leaves far less than all others stays: each of the others would stand in for it.
+    """
+    least = min((c.ratio for c in fitted if not c.effect.is_alone), default=np.inf)
+    most = max(cfg.form_error_ratio, np.sqrt(1 + cfg.search.alone_share * max(least**2 - 1, 0.0)))
+    return [c for c in fitted if not c.effect.is_alone or c.ratio <= most]

@@ -412,7 +412,7 @@ class JointCompliance(ServoEffect):
             Parameter(f"compliance[{t}]", unit, 0.0, 0.0, 10 / kp, 0.2 / kp)
             for t, kp in zip(self.target, gains, strict=True)
         )
-        return (*compliances, Parameter("rotor_damping", "-", 1.0, -0.5, 1.5, 0.5))
+        return (*compliances, Parameter("rotor_damping", "-", 1.0, -0.5, 1.5, 0.5, is_side=True))
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Torque of the spring on the link."""

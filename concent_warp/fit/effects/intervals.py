@@ -31,14 +31,14 @@ class FittedParameter:
     null: float
     """Value at which the effect does nothing."""
     at_bound: bool = False
-    """Whether it has run to a bound that is not the null value."""
+    """Whether it has run to a bound that is not the null value, and says the size of the effect (`Parameter.is_side`)."""
 
     @staticmethod
     def within(p: Parameter, value: float, reach: float) -> FittedParameter:
         """Return a parameter with the interval of a half width about its value, cut at its bounds."""
         low, high = max(value - reach, p.low), min(value + reach, p.high)
         bounds = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
-        at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bounds)
+        at_bound = not p.is_side and any(abs(value - b) < 1e-3 * p.scale for b in bounds)
         return FittedParameter(p.name, value, float(low), float(high), p.unit, p.null, at_bound)
 
     @property

@@ -490,8 +490,10 @@ def test_without_time_for_parts_the_other_candidates_stay(monkeypatch):
     assert made.context.budget.cut == {0}
 
 
-@pytest.mark.parametrize(("ratio", "kept"), [(1.9, True), (2.1, False)])
-def test_a_single_gain_that_leaves_much_is_no_candidate(ratio, kept):
+@pytest.mark.parametrize(
+    ("ratio", "other", "kept"), [(1.9, 1.9, True), (2.1, 2.1, False), (5.0, 8.0, False), (5.0, 10.0, True)]
+)
+def test_a_single_gain_that_leaves_much_is_no_candidate_unless_all_others_leave_far_more(ratio, other, kept):
     part, whole = ActuatorGain("servo", "kp"), ActuatorGain("servo")
-    fitted: list[Any] = [SimpleNamespace(effect=e, ratio=ratio) for e in (part, whole)]
+    fitted: list[Any] = [SimpleNamespace(effect=e, ratio=r) for e, r in ((part, ratio), (whole, other))]
     assert find_addition.without_imitations(fitted, DiagnoseCfg()) == fitted[0 if kept else 1 :]
