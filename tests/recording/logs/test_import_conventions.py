@@ -2,6 +2,7 @@
 
 import pytest
 
+from concent_warp.cli import main
 from concent_warp.recording.logs.channel_names import agreement, parsed
 from concent_warp.recording.logs.suggest import suggest_map
 
@@ -259,3 +260,36 @@ def test_what_a_name_says(name, quantity, role):
 def test_agreement_is_graded():
     graded = ["shoulder_q", "q_shoulder", "shoulder_angle", "shoulder_motor_pos", "elbow_q"]
     assert [agreement(one, "shoulder_q", "shoulder") for one in graded] == [0, 1, 2, 4, None]
+
+
+def test_a_suggestion_says_what_is_not_clear(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "300")
+    suggested(tmp_path, "q_hip,hip_angle,q_knee", "", POSITIONS)
+    assert main(["import", "log.csv", "--model", "leg.xml", "--map", "map.toml", "--suggest"]) == 0
+    said = "no channel for [measured.hip_position]: q_hip and hip_angle fit equally well\n1 guesses or gaps"
+    assert said in capsys.readouterr().out
+
+
+def test_a_dry_run_says_what_is_left_and_what_to_write(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "500")
+    suggested(tmp_path, "a,b,fx,fy,fz", '<motor name="hip" joint="hip"/>', POSITIONS + WRENCH)
+    command = ["import", "log.csv", "--model", "leg.xml", "--map", "map.toml"]
+    write = (
+        'for each that the log has, write [action.hip] and below it source = "CHANNEL", '
+        '[measured.ft_force] and below it source = ["CHANNEL_X", "CHANNEL_Y", "CHANNEL_Z"]'
+    )
+    left = "[measured.knee_position], [measured.ft_force], [measured.ft_torque]"
+    (tmp_path / "map.toml").write_text("# nothing yet\n")
+    for option in (["--dry-run"], ["-o", "demo.h5"]):
+        assert main([*command, *option]) == 2
+        said = (
+            f"map.toml: the map is empty; expected [action.hip], [measured.hip_position], {left}, "
+            f"found no entry, and in the log a, b, fx, fy, fz; {write}.\n"
+        )
+        assert said in capsys.readouterr().err
+    (tmp_path / "map.toml").write_text('[measured]\nhip_position = "a"\n')
+    assert main([*command, "--dry-run"]) == 2
+    said = f"not mapped: b, fx, fy, fz\nwithout a channel: [action.hip], {left}; {write}\n"
+    assert said in capsys.readouterr().out
