@@ -19,7 +19,8 @@ from concent_warp.files import write_text
 from concent_warp.recording.logs.cfg import BopCfg, ImportCfg, PlausibilityCfg
 from concent_warp.recording.logs.episode import ReadChannel
 from concent_warp.recording.logs.import_log import import_log, inspect_log
-from concent_warp.recording.logs.suggest import GAP, suggest_map
+from concent_warp.recording.logs.left_over import to_write
+from concent_warp.recording.logs.suggest import GAP, NONE_FOUND, suggest_map
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import claim_file, make_folder
 
@@ -82,6 +83,8 @@ def run(arguments: Arguments) -> Recording | None:
         gaps = [line.removeprefix(GAP) for line in text.splitlines() if line.startswith(GAP)]
         for gap in gaps:
             say(escape(f"to mend in the MJCF: {gap}"))
+        for entry, why in re.findall(rf"^# (\[.*\])  # {NONE_FOUND}: (.*)$", text, re.MULTILINE):
+            say(escape(f"no channel for {entry}: {why}"))
         guesses = text.count("# guess") + text.count("# no channel found") + len(gaps)
         say(f"{guesses} guesses or gaps are marked; check them, and all units and signs, with --dry-run")
         say_written(arguments.mapping)
@@ -146,6 +149,8 @@ def _dry_run(arguments: Arguments, cfg: ImportCfg) -> None:
         say(_table(episode.channels))
         if k == 0 and episode.unused:
             say(escape(f"not mapped: {', '.join(sorted(episode.unused))}"))
+            if episode.left and (episode.channels or episode.cameras):
+                say(escape(to_write(episode.left)))
         without = [one for one in episode.unmeasured if k == 0 or one in without]
         for error in episode.problems:
             wrong.setdefault(str(error), []).append(name)

@@ -58,6 +58,8 @@ class ReadEpisode:
     """Channels of the log that the map does not name."""
     unmeasured: list[str] = field(default_factory=list)
     """Named sensors of the scene without a channel."""
+    left: list[Target] = field(default_factory=list)
+    """Named actuators and sensors of the scene without a channel or constant."""
     behind: dict[str, int] = field(default_factory=dict)
     """Samples that were out of order and were sorted, by kind and name of their channel."""
 
@@ -118,9 +120,12 @@ def read_episode(
     made = Demonstration(name, episode.task, episode.success, None, None, action, measured, image=image)
     distinct = list({str(error): error for error in problems}.values())
     behind = {one.label: one.behind for one in channels if one.behind}
-    unmeasured = [name for name in targets_of(m)[1] if name not in measured]
+    actuators, sensors = targets_of(m)
+    unmeasured = [name for name in sensors if name not in measured]
+    left = [one for one in actuators.values() if one.name not in (*action, *wrong)]
+    left += [sensors[name] for name in unmeasured]
     unused = _unused(episode, mapping, channels)
-    return ReadEpisode(made, start, lines, cameras, distinct, unused, unmeasured, behind)
+    return ReadEpisode(made, start, lines, cameras, distinct, unused, unmeasured, left, behind)
 
 
 def _unused(episode: Episode, mapping: LogMap, channels: list[Numbers]) -> list[str]:

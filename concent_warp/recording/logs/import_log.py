@@ -17,12 +17,13 @@ from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.logs.bop.import_bop import BopImport, open_bop
 from concent_warp.recording.logs.cfg import ImportCfg
 from concent_warp.recording.logs.episode import ReadChannel, ReadEpisode, read_episode
+from concent_warp.recording.logs.left_over import empty_map
 from concent_warp.recording.logs.log_map import LogMap, read_map
 from concent_warp.recording.logs.readers.calibration import FILE, Calibration, read_calibration
 from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Log
 from concent_warp.recording.logs.readers.open_log import open_log
-from concent_warp.recording.logs.scene_gaps import nothing_measured
+from concent_warp.recording.logs.scene_gaps import nothing_measured, scene_gaps
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.unwind import unwound
@@ -115,7 +116,7 @@ def _map_of(mapping: Path | str | LogMap | None) -> LogMap | None:
     """Return a map, read if it is a file that is there; one that is not there is refused where it is needed."""
     if mapping is None or isinstance(mapping, LogMap):
         return mapping
-    return read_map(Path(mapping)) if Path(mapping).exists() else None
+    return read_map(Path(mapping), empty=True) if Path(mapping).exists() else None
 
 
 def _parts(mapping: LogMap | None) -> frozenset[str]:
@@ -178,7 +179,7 @@ def _read(
     logs = [open_log(source, parts) for source in sources]
     scene = scene_of(_needed(model, "scene", "--model robot.xml"))
     mapping = _needed(mapping, "map", "--map robot.toml, which --suggest writes")
-    mapping = mapping if isinstance(mapping, LogMap) else read_map(Path(mapping))
+    mapping = mapping if isinstance(mapping, LogMap) else read_map(Path(mapping), empty=True)
     if len(logs) > 1 and cfg.episodes:
         raise RecordingError("episodes are of one log", found=f"{len(logs)} logs", fix="import the logs one by one")
     return scene, _counted(logs, scene, mapping, cfg)
@@ -207,7 +208,10 @@ def _episodes(log: Log, scene: Scene, mapping: LogMap, cfg: ImportCfg) -> Iterat
         raise RecordingError("the log has no episodes", where=log.source)
     for k, number in enumerate(dict.fromkeys(numbers)):
         read = read_episode(log.episode(number), mapping, scene.model, file, cfg)
-        if not (mapping.measured or mapping.body or mapping.image):
+        if not (mapping.action or mapping.measured or mapping.body or mapping.image):
+            gaps = [RecordingError(one, where=mapping.source) for one in scene_gaps(scene)]
+            read.problems[:] = [empty_map(mapping.source, read.left, read.unused), *gaps]
+        elif not (mapping.measured or mapping.body or mapping.image):
             fix = nothing_measured(scene)
             read.problems.append(RecordingError("the map names no measurement", where=mapping.source, fix=fix))
         if not read.problems:

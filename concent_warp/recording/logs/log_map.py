@@ -133,8 +133,12 @@ class LogMap:
 KINDS = {"clock": ClockEntry, "action": NumberEntry, "measured": NumberEntry, "body": BodyEntry, "image": ImageEntry}
 
 
-def read_map(path: Path) -> LogMap:
+def read_map(path: Path, *, empty: bool = False) -> LogMap:
     """Read a map file.
+
+    Args:
+        path: The file.
+        empty: Whether it may have no entries.
 
     Raises:
         RecordingError: It cannot be read, or has entries that are unknown or make no sense.
@@ -155,7 +159,7 @@ def read_map(path: Path) -> LogMap:
     calibration = document.get("calibration")
     if calibration is not None and not isinstance(calibration, str):
         raise RecordingError("calibration is not the name of a file", where=path, found=repr(calibration))
-    if not (found["action"] or found["measured"] or found["body"] or found["image"]):
+    if not (empty or found["action"] or found["measured"] or found["body"] or found["image"]):
         raise RecordingError("the map is empty", where=path, expected="[action.*], [measured.*], [body.*] or [image.*]")
     return LogMap(str(path), None if calibration is None else path.parent / calibration, **found)
 

@@ -62,6 +62,11 @@ def measured_gaps(scene: Scene, sought: Collection[str] = ()) -> list[str]:
     return found
 
 
+def scene_gaps(scene: Scene, sought: Collection[str] = ()) -> list[str]:
+    """Return a sentence for each thing that a scene lacks for a log to be mapped to it; see `measured_gaps`."""
+    return [one for one in (nameless_actuators(scene.model), *measured_gaps(scene, sought)) if one]
+
+
 def nothing_measured(scene: Scene) -> str:
     """Return what is to be done about a map that names no measurement."""
     if gaps := measured_gaps(scene):

@@ -125,12 +125,13 @@ def parted_unit(name: str) -> tuple[list[str], str]:
     """Return the words of a name before the unit at its end, and that unit: ``stage, pos`` and ``mm`` of
     ``stage/pos_mm``. Without a unit these are all words and an empty text.
     """
-    whole = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]  # the unit of torque_mNm is one word
+    spans = list(re.finditer(r"[a-z0-9]+", name.lower())) if len(name.lower()) == len(name) else []
+    whole = [hit[0] for hit in spans]  # the unit of torque_mNm is one word
     for words in (whole, words_of(name)):
         for count in range(min(MOST_WORDS, len(words)), 0, -1):
             end = tuple(words[-count:])
             if end in ENDINGS and (end[-1] not in WEAK_WORDS or len(words) > count):
-                return words[:-count], ENDINGS[end]
+                return words_of(name[: spans[-count].start()]) if words is whole else words[:-count], ENDINGS[end]
     return words_of(name), ""
 
 
@@ -151,7 +152,7 @@ def named_unit(name: str, quantity: Quantity) -> str | None:
 
 def contrary_unit(name: str, quantity: Quantity) -> str | None:
     """Return the unit at the end of a name that is none of a quantity: ``rpm`` of ``motor_rpm`` for a torque."""
-    if quantity in ("any", "orientation") or _is_weak(name):
+    if quantity in ("any", "orientation") or is_weak(name):
         return None
     unit = parted_unit(name)[1]
     return unit if unit and not _fitting(name, quantity) else None
@@ -162,12 +163,12 @@ def _fitting(name: str, quantity: Quantity) -> str:
     unit = parted_unit(name)[1]
     if unit in SHARES:
         return "" if quantity == "orientation" else unit
-    if not unit or (quantity == "any" and _is_weak(name)):
+    if not unit or (quantity == "any" and is_weak(name)):
         return ""
     return unit if quantity in (UNITS[unit][0], "any") else RATES.get((unit, quantity), "")
 
 
-def _is_weak(name: str) -> bool:
+def is_weak(name: str) -> bool:
     """Return whether what seems to be a unit at the end of a name may say other things."""
     words, unit = parted_unit(name)
     return bool(unit) and len(words) == len(words_of(name)) - 1 and words_of(name)[-1] in WEAK_WORDS
