@@ -24,7 +24,7 @@ from concent_warp.diagnosis.search.form_error import flexible_correction
 from concent_warp.diagnosis.search.holding import hold
 from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values, stays_within
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
-from concent_warp.diagnosis.search.time_step import finer_time_step, renew_defects
+from concent_warp.diagnosis.search.time_step import at_finer_step, finer_time_step, renew_defects
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
 from concent_warp.fit.effects.observe import has_touchable_free_body
 from concent_warp.simulate.time_limit import TimeUpError
@@ -324,13 +324,19 @@ class Additions:
         before, unsettled = context.record.copy(), "Open: whether nominal values alone explain the data."
 
         def attempt() -> FittedModel | None:
-            """Return the model where nominal values take away most of what is left."""
+            """Return the model where nominal values take away most of what is left, if need be with a shorter step."""
             enough, least = partial(context.is_little, first=given), cfg.nominal.decisive_gain
-            found = self._nominal(self.with_holding(given), enough, dependent=True, with_step=True, least=least)
-            if found is None or not is_lacking(found, context.noise_factors, cfg):
+            held = self.with_holding(given)
+            found = self._nominal(held, enough, dependent=True, least=least)
+            if found is not None and not is_lacking(found, context.noise_factors, cfg):
                 return found
-            finer = self._finer(found)
-            return found if finer is None else self._adopt([found], finer)[-1]
+            # Values at their bounds stand in for a part of the step's error, and then hide what it would explain.
+            if (finer := at_finer_step(held, cfg.time_step)) is None:
+                return found
+            both = self._nominal(finer, enough, dependent=True, least=least)
+            if both is None or (found is not None and not self._needs_step(found, both)):
+                return found
+            return self._adopt([held if found is None else found], both)[-1]
 
         found = context.budget.attempt(attempt, None, unsettled)
         if found is None or (is_lacking(found, context.noise_factors, cfg) and not context.is_little(found, given)):

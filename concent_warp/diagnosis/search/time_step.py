@@ -82,6 +82,18 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     return found if explains_more(base, found, cfg) else None
 
 
+def at_finer_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel | None:
+    """Return a fitted model with a shorter time step, fitted again; None where the step's error is small or bodies touch.
+
+    Args:
+        base: The fitted model.
+        cfg: Settings.
+    """
+    if not all(w.smooth for w in base.windows) or (division := _division(base, cfg)) < 2:
+        return None
+    return renew_defects(refitted(_with_defects(base, base.timestep / division)), cfg)
+
+
 def renew_defects(one: FittedModel, cfg: TimeStepCfg) -> FittedModel:
     """Return a fitted model with a shorter time step with the defects of its own motion, fitted again until they stay.
 
