@@ -32,6 +32,7 @@ CHANGED_IN_PLACE = {
     "Iteration",
     "_Claims",
     "TrackCheckpoint",
+    "Matches",
 }
 """Dataclasses that hold a state, or that grow while they are filled."""
 

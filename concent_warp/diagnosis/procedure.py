@@ -225,11 +225,8 @@ class Procedure:
         far = "Open: how far the model as given is off over short windows."
         if fitted[0] is given and (coarse := attempt(lambda: self.coarse_baseline(given), None, far)) is not None:
             found, detectable = add_effects([coarse], detectable, effects_alone=True)
-            fitted = attempt(
-                lambda: self.carry_over(given, found),
-                [],
-                "Not refitted: values over windows as long as the motion allows.",
-            )
+            unsettled = "Not refitted: values over windows as long as the motion allows."
+            fitted = attempt(lambda: self.carry_over(given, found), [], unsettled)
             if not fitted:
                 budget.cut |= set(range(len(found)))
                 return found, detectable
@@ -399,7 +396,9 @@ class Procedure:
             )
         if unknown is not None and unknown.varies and context.explains(begun, begun, added=False):
             # What changes from window to window, where the model as given leaves no more than noise, is no effect.
-            record.refuse(lambda _: True, "its value changes from window to window, and noise explains the data as well")
+            record.refuse(
+                lambda _: True, "its value changes from window to window, and noise explains the data as well"
+            )
             record.keep_groups(0)
             return self.conclude(given, self.revision.restore_given([begun], given), detectable, issues)
         verdict: Verdict = "none_needed"

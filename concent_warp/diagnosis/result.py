@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -141,15 +141,7 @@ class UnknownForceFound:
 
     def to_json(self) -> dict[str, Any]:
         """Return the force in plain types."""
-        return {
-            "words": self.words,
-            "gain": self.gain,
-            "p": self.p,
-            "share": self.share,
-            "instead": self.instead,
-            "form_error": self.form_error,
-            "varies": self.varies,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -189,7 +181,7 @@ class HoldingFriction:
 
 @dataclass(frozen=True)
 class FinerTimeStep:
-    """A shorter time step with which the model explains more, before any effect or of impacts beside one of contacts."""
+    """A shorter time step with which the model explains more, before any effect, or one for impacts."""
 
     given: float
     """Time step of the model as given [s]."""
@@ -207,8 +199,8 @@ class FinerTimeStep:
     too_long: bool = False
     """Whether the error that the used step still has may be all that is left, so that nothing can be said."""
     impacts: bool = False
-    """Whether it is for impacts alone: `change` is then the scatter of predictions by when between two steps they begin,
-    and `gain` the share of that which it removes."""
+    """Whether it is for impacts alone: `change` is then the scatter of predictions by when between two steps these
+    begin, and `gain` the share of that which it removes."""
 
     @property
     def error(self) -> float:
@@ -222,10 +214,10 @@ class FinerTimeStep:
         """A sentence on the time step."""
         if self.impacts:
             return (
-                f"The model's time step of {1e3 * self.given:.3g} ms is too long for its impacts: when between two steps "
-                f"they begin scatters its predictions by {_times(self.change)} x noise (rms), with "
-                f"{1e3 * self.used:.3g} ms by {_times(self.error)} x. Constants of contacts are those of that step, which "
-                "a saved model has."
+                f"The model's time step of {1e3 * self.given:.3g} ms is too long for its impacts: when between two "
+                f"steps they begin scatters its predictions by {_times(self.change)} x noise (rms), with "
+                f"{1e3 * self.used:.3g} ms by {_times(self.error)} x. Constants of contacts are those of that step, "
+                "which a saved model has."
             )
         said = (
             f"The model's time step of {1e3 * self.given:.3g} ms is too long for these data: with "
@@ -242,8 +234,8 @@ class FinerTimeStep:
     def to_json(self) -> dict[str, Any]:
         """Return the time step in plain types."""
         gain = {"value": self.gain, "interval": [self.low, self.high]}
-        return {"given": self.given, "used": self.used, "change": self.change, "gain": gain,
-                "error": self.error, "too_long": self.too_long, "impacts": self.impacts}  # fmt: skip
+        kept = {"error": self.error, "too_long": self.too_long, "impacts": self.impacts}
+        return {"given": self.given, "used": self.used, "change": self.change, "gain": gain, **kept}
 
 
 @dataclass(frozen=True)

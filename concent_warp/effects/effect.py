@@ -86,7 +86,7 @@ class Parameter:
     """The same in the odds between effects that explain as much, where it is more than `scale`: what experience expects
     may be more than a step over which motion is linear."""
     is_side: bool = False
-    """Whether it is no size of the effect but a choice within its formula, whose bounds say nothing of what is missing."""
+    """Whether it is no size of the effect but a choice within its formula: its bounds say nothing of what is left."""
 
 
 class Effect:

@@ -96,10 +96,15 @@ def driven() -> Recording:
         final = GAIN * u / (GAIN + 1.03 * DAMPING)
         for _ in range(40):  # exact where the command is held
             share = np.exp(-(GAIN + 1.03 * DAMPING) / MASS * h)
-            x, v = x + final * h + (v - final) * (1 - share) * MASS / (GAIN + 1.03 * DAMPING), final + (v - final) * share
+            x, v = (
+                x + final * h + (v - final) * (1 - share) * MASS / (GAIN + 1.03 * DAMPING),
+                final + (v - final) * share,
+            )
     read = np.round(np.array(rows) + rng.normal(0, 2e-6, len(rows)), 6)
     demo = Demonstration(
-        "demo_0", action={"drive": Channel(clock, command[:, None])}, measured={"encoder": Channel(clock, read[:, None])}
+        "demo_0",
+        action={"drive": Channel(clock, command[:, None])},
+        measured={"encoder": Channel(clock, read[:, None])},
     )
     return Recording(SLIDE, (demo,))
 

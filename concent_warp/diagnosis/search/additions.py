@@ -23,8 +23,8 @@ from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
 from concent_warp.diagnosis.search.holding import hold
 from concent_warp.diagnosis.search.nominal_values import has_bounded_nominal_values, stays_within
-from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import at_finer_step, finer_time_step, renew_defects
+from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
 from concent_warp.fit.effects.observe import has_touchable_free_body
 from concent_warp.simulate.time_limit import TimeUpError

@@ -83,7 +83,7 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
 
 
 def at_finer_step(base: FittedModel, cfg: TimeStepCfg) -> FittedModel | None:
-    """Return a fitted model with a shorter time step, fitted again; None where the step's error is small or bodies touch.
+    """Return a fitted model with a shorter time step, fitted again; None where its error is small or bodies touch.
 
     Args:
         base: The fitted model.

@@ -31,7 +31,7 @@ class FittedParameter:
     null: float
     """Value at which the effect does nothing."""
     at_bound: bool = False
-    """Whether it has run to a bound that is not the null value, and says the size of the effect (`Parameter.is_side`)."""
+    """Whether it has run to a bound that is not the null value; of `Parameter.is_side` it does not count."""
 
     @staticmethod
     def within(p: Parameter, value: float, reach: float) -> FittedParameter:
