@@ -195,12 +195,10 @@ class FinerTimeStep:
     """Lower end of the 95 % interval of the gain."""
     high: float
     """Upper end."""
-
     too_long: bool = False
     """Whether the error that the used step still has may be all that is left, so that nothing can be said."""
     impacts: bool = False
-    """Whether it is for impacts alone: `change` is then the scatter of predictions by when between two steps these
-    begin, and `gain` the share of that which it removes."""
+    """Whether it is for impacts: `change` is their scatter by when between two steps they begin, `gain` its fall."""
 
     @property
     def error(self) -> float:
@@ -233,8 +231,8 @@ class FinerTimeStep:
 
     def to_json(self) -> dict[str, Any]:
         """Return the time step in plain types."""
-        gain = {"value": self.gain, "interval": [self.low, self.high]}
         kept = {"error": self.error, "too_long": self.too_long, "impacts": self.impacts}
+        gain = {"value": self.gain, "interval": [self.low, self.high]}
         return {"given": self.given, "used": self.used, "change": self.change, "gain": gain, **kept}
 
 
