@@ -102,8 +102,38 @@ def test_over_short_windows_time_step_and_nominal_values_stay_as_given(monkeypat
     monkeypatch.setattr(made.additions, "add_effects", add)
     monkeypatch.setattr(made, "coarse_baseline", lambda _given: coarse[0])
     monkeypatch.setattr(made, "carry_over", lambda base, found: [base, *found[1:]])
+    monkeypatch.setattr(made.additions, "within_tolerances", lambda _given: None)
     assert made.search(given) == (["long"], ("size",))
     assert asked == [([coarse[0]], (), True), ([given, *coarse[1:]], ("size",), False)]
+
+
+@pytest.mark.parametrize(
+    ("left", "stepped", "step", "found"),
+    [(1.0, None, False, "nominal"), (8.0, 1.0, True, "both"), (8.0, 3.0, False, None), (None, None, False, None)],
+)
+def test_a_model_that_is_far_off_is_first_tried_with_constants_within_their_tolerance(
+    monkeypatch, left, stepped, step, found
+):
+    made, given, finer = procedure(), node(30.0, 900.0), node(29.0, 850.0, timestep=FINER)
+    nominal = {
+        id(given): None if left is None else node(left, left**2, name="nominal"),
+        id(finer): None if stepped is None else node(stepped, stepped**2, name="both", timestep=FINER),
+    }
+    monkeypatch.setattr(made.additions, "with_holding", lambda one: one)
+    monkeypatch.setattr(made.additions, "_nominal", lambda one, *_, **__: nominal[id(one)])
+    monkeypatch.setattr(additions, "at_finer_step", lambda *_: finer)
+    monkeypatch.setattr(additions, "time_step_finding", lambda *_: "step")
+    monkeypatch.setattr(additions, "has_touchable_free_body", lambda _m: False)
+    given.model.compile = lambda: None
+    one = made.additions.within_tolerances(given)
+    assert (None if one is None else one.model.name) == found
+    assert made.record.time_step == ("step" if step else None)
+    if found is not None:
+        asked: list[Any] = []
+        monkeypatch.setattr(made.additions, "add_effects", lambda fitted, *_: (asked.append(fitted) or fitted, ()))
+        monkeypatch.setattr(made, "coarse_baseline", lambda _given: pytest.fail("short windows"))
+        made.search(given)
+        assert [[n.model.name for n in fitted] for fitted in asked] == [[found]]
 
 
 def test_the_answer_starts_with_the_model_as_given(monkeypatch):
@@ -244,7 +274,7 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
         finding("later", 0.96, accepted=False, step=1),
     ]  # fmt: skip
     # A share below zero stands for an error of form.
-    force = None if unknown is None else SimpleNamespace(share=abs(unknown), form_error=unknown < 0)
+    force = None if unknown is None else SimpleNamespace(share=abs(unknown), form_error=unknown < 0, varies=False)
     force_is(monkeypatch, lambda nodes, _cfg, _results: force if len(nodes) else None)
     nodes = [node(r, name=str(r)) for r in ratios]
     found = made.conclude(nodes[0], nodes, ("size",), ["a gap"])

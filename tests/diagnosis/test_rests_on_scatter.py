@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.adequacy import qualified_by_noise, rests_on_scatter
-from concent_warp.fit.effects.observation import NumericalScatter
+from concent_warp.fit.effects.observation import NumericalScatter, Window
 from tests.diagnosis.made_up import node
 from tests.diagnosis.test_uncertain_noise import answer
 
@@ -21,7 +22,9 @@ def fitted(noise_ratio: float, residual: float, scatter: NumericalScatter | None
     """Return a fitted model that leaves a residual over noise and scatter."""
     one = node(noise_ratio)
     one.noise_ratio = noise_ratio
-    one.windows[0].scatter, one.windows[0].common = scatter, common
+    window = one.windows[0]
+    window.scatter, window.common = scatter, common
+    window.without_scatter = partial(Window.without_scatter, window)
     one.fit.linear = [SimpleNamespace(residual=np.full(4, residual))]
     return one
 

@@ -265,6 +265,13 @@ def test_what_may_be_the_error_of_the_shorter_step_is_no_sign_that_something_is_
     assert too_long.to_json()["too_long"]
 
 
+def test_a_step_for_impacts_says_by_how_much_their_scatter_falls():
+    step = FinerTimeStep(2e-3, 2.5e-4, 27.0, 0.55, 0.55, 0.55, impacts=True)
+    assert step.error == pytest.approx(0.45 * 27)
+    assert "27 x noise (rms), with 0.25 ms by 12 x" in step.sentence
+    assert step.to_json()["impacts"]
+
+
 def test_simulations_take_the_longest_steps_that_change_little_and_predict_what_the_given_ones_do():
     given, limits = fitted(swung(damping=0.0, timestep=FINE), timestep=FINE), TimeStepCfg(max_error_of_longer=4.0)
     found = longer_time_step(given, limits)

@@ -141,6 +141,30 @@ def test_the_scatter_covers_what_a_start_between_two_steps_changes(share):
     np.testing.assert_allclose(scatter_of(window).whitened(fall), fall, atol=0.02 * fall.max())
 
 
+@pytest.mark.parametrize("own", [None, np.array([0.0, 2.0, 0.5, 1.0])])
+def test_the_size_of_scatter_is_that_of_its_covariance(own):
+    deviations = np.random.default_rng(3).normal(size=(4, 2))
+    covariance = deviations @ deviations.T + np.diag(np.ones(4) if own is None else 1 + own**2)
+    found = NumericalScatter(deviations, own)
+    assert found.log_determinant == pytest.approx(np.linalg.slogdet(covariance).logabsdet)
+    assert found.square == pytest.approx(np.trace(covariance) - 4)
+
+
+def test_residuals_without_scatter_are_in_units_of_noise_alone():
+    deviations, common = np.array([[3.0], [0.0], [4.0]]), np.array([[0.0], [2.0], [0.0]])
+    window = Window.__new__(Window)
+    residual = np.array([1.0, -2.0, 0.5])
+    for scatter, shared, expected in (
+        (None, None, residual),
+        (deviations, None, residual),
+        (np.hstack([deviations, common]), common, NumericalScatter(common).whitened(residual)),
+    ):
+        object.__setattr__(window, "scatter", None if scatter is None else NumericalScatter(scatter))
+        object.__setattr__(window, "common", shared)
+        seen = residual if scatter is None else NumericalScatter(scatter).whitened(residual)
+        np.testing.assert_allclose(window.without_scatter(seen), expected)
+
+
 def test_predictions_of_a_window_with_scatter_are_whitened():
     model, window = window_of(0.5)
     plain = replace(window, scatter=None)
