@@ -122,7 +122,7 @@ class AdditionFinder:
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
             fitted = fits.fit(more, max(critical, cfg.min_gain), short_windows, least)
-            fitted = without_imitations(fitted, cfg)
+            fitted = without_imitations(base, fitted, cfg)
         for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
             context.budget.note(sentence, step if decides else None)
         if not fitted and fits.left:
@@ -327,11 +327,11 @@ class AdditionFinder:
         return self.gradient.apply(base, screened, context.runner) if self.gradient else screened
 
 
-def without_imitations(fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:
+def without_imitations(base: FittedModel, fitted: Sequence[FittedCandidate], cfg: DiagnoseCfg) -> list[FittedCandidate]:
     """Return candidates less those that count only where they explain the data alone, and leave more than they may.
 
-    One of these that leaves far less than all others stays: each of the others would stand in for it.
+    One of these that leaves far less than all others, and the model itself, stays: each other would stand in for it.
     """
-    least = min((c.ratio for c in fitted if not c.effect.is_alone), default=np.inf)
+    least = min((c.ratio for c in fitted if not c.effect.is_alone), default=base.ratio)
     most = max(cfg.form_error_ratio, np.sqrt(1 + cfg.search.alone_share * max(least**2 - 1, 0.0)))
     return [c for c in fitted if not c.effect.is_alone or c.ratio <= most]

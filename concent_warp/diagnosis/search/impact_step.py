@@ -15,7 +15,7 @@ from concent_warp.diagnosis.candidates.baseline import fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import FinerTimeStep
-from concent_warp.diagnosis.search.time_step import with_time_step
+from concent_warp.diagnosis.search.time_step import with_time_step, without_defects
 from concent_warp.fit.effects.impacts import impacts
 from concent_warp.fit.effects.robust import huber
 from concent_warp.fit.effects.scatter import with_scatter
@@ -41,7 +41,7 @@ def resolved_impacts(last: FittedModel, cfg: DiagnoseCfg) -> tuple[FittedModel, 
         return None
     finer = with_time_step(last, last.timestep / division)
     begun = [offset * w.spread for offset, w in zip(last.fit.offsets, last.windows, strict=True)]
-    plain = [replace(w, defect=None) for w in last.windows]
+    plain = without_defects(last).windows
     windows = tuple(with_scatter(finer.delivered, plain, last.engine, last.cfg.observation, begun))
     solver = replace(finer, windows=windows).solver()
     fit = solver.fit(last.fit.values, last.fit.offsets, last.fit.starts)

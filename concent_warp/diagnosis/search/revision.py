@@ -178,9 +178,7 @@ class Revision:
         return [*fitted[:-1], last]
 
     def with_resolved_impacts(self, fitted: list[FittedModel]) -> list[FittedModel]:
-        """Return the fitted models, the last with a time step that resolves impacts where constants of contacts rest on
-        them.
-        """
+        """Return the fitted models, the last with a step that resolves impacts where an effect is one of contacts."""
         context, record = self.context, self.context.record
         if record.time_step is not None or all(f.family != "contact" for f in record.accepted()):
             return fitted

@@ -196,7 +196,7 @@ def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> boo
         step: The time step that it uses.
         cfg: Settings.
     """
-    if step.error <= cfg.max_error_left:
+    if step.impacts or step.error <= cfg.max_error_left:  # scatter of impacts counts as noise already
         return False
     return bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
 

@@ -496,4 +496,6 @@ def test_without_time_for_parts_the_other_candidates_stay(monkeypatch):
 def test_a_single_gain_that_leaves_much_is_no_candidate_unless_all_others_leave_far_more(ratio, other, kept):
     part, whole = ActuatorGain("servo", "kp"), ActuatorGain("servo")
     fitted: list[Any] = [SimpleNamespace(effect=e, ratio=r) for e, r in ((part, ratio), (whole, other))]
-    assert find_addition.without_imitations(fitted, DiagnoseCfg()) == fitted[0 if kept else 1 :]
+    assert find_addition.without_imitations(node(50.0), fitted, DiagnoseCfg()) == fitted[0 if kept else 1 :]
+    # Where it is the only candidate, the model itself is what leaves more.
+    assert find_addition.without_imitations(node(other), fitted[:1], DiagnoseCfg()) == fitted[: int(kept)]

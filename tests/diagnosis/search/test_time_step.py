@@ -270,6 +270,10 @@ def test_a_step_for_impacts_says_by_how_much_their_scatter_falls():
     assert step.error == pytest.approx(0.45 * 27)
     assert "27 x noise (rms), with 0.25 ms by 12 x" in step.sentence
     assert step.to_json()["impacts"]
+    # That scatter counts as noise already: what is left beyond both is no error of the step.
+    last: Any = SimpleNamespace(noise_ratio=3.0)
+    assert may_be_step(last, replace(step, impacts=False, change=84.0), TimeStepCfg())
+    assert not may_be_step(last, step, TimeStepCfg())
 
 
 def test_simulations_take_the_longest_steps_that_change_little_and_predict_what_the_given_ones_do():

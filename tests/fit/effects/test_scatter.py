@@ -1,6 +1,8 @@
 """Numerical scatter: whitening, and what the phase of the time grid changes in the motion of a bouncing ball."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -152,17 +154,15 @@ def test_the_size_of_scatter_is_that_of_its_covariance(own):
 
 def test_residuals_without_scatter_are_in_units_of_noise_alone():
     deviations, common = np.array([[3.0], [0.0], [4.0]]), np.array([[0.0], [2.0], [0.0]])
-    window = Window.__new__(Window)
     residual = np.array([1.0, -2.0, 0.5])
     for scatter, shared, expected in (
         (None, None, residual),
         (deviations, None, residual),
         (np.hstack([deviations, common]), common, NumericalScatter(common).whitened(residual)),
     ):
-        object.__setattr__(window, "scatter", None if scatter is None else NumericalScatter(scatter))
-        object.__setattr__(window, "common", shared)
+        window: Any = SimpleNamespace(scatter=None if scatter is None else NumericalScatter(scatter), common=shared)
         seen = residual if scatter is None else NumericalScatter(scatter).whitened(residual)
-        np.testing.assert_allclose(window.without_scatter(seen), expected)
+        np.testing.assert_allclose(Window.without_scatter(window, seen), expected)
 
 
 def test_predictions_of_a_window_with_scatter_are_whitened():
