@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from concent_warp.comparison.units import interval_texts, p_value_text
+from concent_warp.diagnosis.constants import FinerTimeStep, HoldingConstraint
 from concent_warp.diagnosis.detectable import Detectable, detectable_sentence
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
 from concent_warp.diagnosis.replayed import Replayed
@@ -17,7 +18,6 @@ from concent_warp.diagnosis.values_text import SCATTER_CLAUSE, nominal_sentence,
 from concent_warp.effects.table import posteriors_table
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
-from concent_warp.scene.holding import Holding
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these", "unsettled"]
 FARTHER = (
@@ -145,98 +145,6 @@ class UnknownForceFound:
 
 
 @dataclass(frozen=True)
-class HoldingFriction:
-    """Dry friction that holds, by constants that the MJCF leaves at their defaults, before any effect."""
-
-    where: Holding
-    """Where it acts."""
-    settings: Mapping[str, str]
-    """The constants as attributes of the MJCF."""
-    gain: float
-    """Share of the held-out error that they remove [-]."""
-    low: float
-    """Lower end of the 95 % interval of the gain."""
-    high: float
-    """Upper end."""
-    beside: str = ""
-    """Effect that was fitted with and without them, and is not part of the gain; empty for none."""
-
-    @property
-    def sentence(self) -> str:
-        """A sentence on the friction."""
-        values = " and ".join(f'{name}="{value}"' for name, value in self.settings.items())
-        if self.where == "cones":
-            what = f"contact friction depends on the direction, by the simulator's default: with {values} it does not"
-        else:
-            what = f"dry friction in {self.where} creeps, by default constants of the simulator: with {values} it holds"
-        fall = f"{100 * self.gain:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]"
-        fall += f", {self.beside} fitted in both" if self.beside else ""
-        return f"The model's {what}, and the held-out error falls by {fall}; the diagnosis uses it."
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it in plain types."""
-        gain = {"value": self.gain, "interval": [self.low, self.high]}
-        return {"where": self.where, "settings": dict(self.settings), "gain": gain, "beside": self.beside}
-
-
-@dataclass(frozen=True)
-class FinerTimeStep:
-    """A shorter time step with which the model explains more, before any effect, or one for impacts."""
-
-    given: float
-    """Time step of the model as given [s]."""
-    used: float
-    """Time step of the diagnosis, and of the model that it returns [s]."""
-    change: float
-    """By how much it changes the predictions: root mean square over the noise, initial states fitted [-]."""
-    gain: float
-    """Share of the held-out error that it removes [-]."""
-    low: float
-    """Lower end of the 95 % interval of the gain."""
-    high: float
-    """Upper end."""
-    too_long: bool = False
-    """Whether the error that the used step still has may be all that is left, so that nothing can be said."""
-    impacts: bool = False
-    """Whether it is for impacts: `change` is their scatter by when between two steps they begin, `gain` its fall."""
-
-    @property
-    def error(self) -> float:
-        """Error of the predictions that the used step still has over the noise [-]: in proportion to the step."""
-        if self.impacts:
-            return self.change * (1 - self.gain)
-        return self.change / max(self.given / self.used - 1, 1e-12)
-
-    @property
-    def sentence(self) -> str:
-        """A sentence on the time step."""
-        if self.impacts:
-            return (
-                f"The model's time step of {1e3 * self.given:.3g} ms is too long for its impacts: when between two "
-                f"steps they begin scatters its predictions by {_times(self.change)} x noise (rms), with "
-                f"{1e3 * self.used:.3g} ms by {_times(self.error)} x. Constants of contacts are those of that step, "
-                "which a saved model has."
-            )
-        said = (
-            f"The model's time step of {1e3 * self.given:.3g} ms is too long for these data: with "
-            f"{1e3 * self.used:.3g} ms its predictions change by {_times(self.change)} x noise, and the held-out error "
-            f"falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]; the diagnosis uses it."
-        )
-        if self.too_long:
-            said += (
-                f" Its own error is still about {_times(self.error)} x noise, which may be all that is left: shorten "
-                'the step of the model further, or set integrator="RK4" where it has no contacts, and diagnose again.'
-            )
-        return said
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the time step in plain types."""
-        kept = {"error": self.error, "too_long": self.too_long, "impacts": self.impacts}
-        gain = {"value": self.gain, "interval": [self.low, self.high]}
-        return {"given": self.given, "used": self.used, "change": self.change, "gain": gain, **kept}
-
-
-@dataclass(frozen=True)
 class Diagnosis:
     """Which physical effect a model lacks.
 
@@ -283,8 +191,8 @@ class Diagnosis:
     "effect" or "group", or than "unsettled" for the sake of this replay and a noise that is too uncertain."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
-    holding: tuple[HoldingFriction, ...] = ()
-    """Where the data ask for dry friction that holds, by other constants of the simulator than its defaults."""
+    holding: tuple[HoldingConstraint, ...] = ()
+    """Where the data ask for constraints that hold, by other constants of the simulator than its defaults."""
     nominal_values: tuple[FittedParameter, ...] = ()
     """Masses, lengths, gains and latencies that the data ask for within their tolerance; factors but for latencies."""
     unsettled: tuple[str, ...] = ()
@@ -351,6 +259,7 @@ class Diagnosis:
             "time_step": None if self.time_step is None else self.time_step.to_json(),
             "holding": [h.to_json() for h in self.holding],
             "nominal_values": [_parameter(p) for p in self.nominal_values],
+            "changes_besides": self.changes_besides(),
             "posterior": self._posterior(),
             "ratio": list(self.ratio),
             "rests_on_scatter": self.rests_on_scatter,
@@ -441,13 +350,13 @@ class Diagnosis:
             said.append(self.unknown_force.sentence)
         if self.next_experiment:
             said.append(f"Next experiment: {self.next_experiment.sentence}")
-        numerical = [h.sentence for h in self.holding]
-        numerical += [] if self.time_step is None else [self.time_step.sentence]
-        if self.nominal_values:
-            numerical.append(nominal_sentence(self.nominal_values))
-        if self.farther and not self.accepted:
-            numerical.append(FARTHER)
-        return [*self.issues, *numerical, *said, *self.unsettled]
+        farther = [FARTHER] if self.farther and not self.accepted else []
+        return [*self.issues, *self.changes_besides(), *farther, *said, *self.unsettled]
+
+    def changes_besides(self) -> list[str]:
+        """Return a sentence on each thing that the last model has besides effects: constants and nominal values."""
+        said = [one.sentence for one in (*self.holding, self.time_step) if one is not None]
+        return [*said, nominal_sentence(self.nominal_values)] if self.nominal_values else said
 
 
 def _percent(share: float) -> str:
@@ -483,11 +392,6 @@ def _parameter(p: FittedParameter) -> dict[str, Any]:
     """Return a fitted parameter in plain types."""
     interval = [_number(p.low), _number(p.high)]
     return {"name": p.name, "value": _number(p.value), "interval": interval, "unit": p.unit, "null": _number(p.null)}
-
-
-def _times(ratio: float) -> str:
-    """Return a ratio to the noise in words of two digits, without an exponent."""
-    return f"{ratio:.2g}" if ratio < 10 else f"{ratio:.0f}"
 
 
 def _number(value: float) -> float | None:

@@ -47,6 +47,8 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
     found = ['<section id="diagnosis">', "<h2>What is missing</h2>"]
     found.append(f'<p class="answer {ANSWER_CLASSES[verdict]}">{escape(_headline(diagnosis))}</p>')
     found += [f"<p>{escape(_group_sentence(group))}</p>" for group in diagnosis.get("groups", ()) if len(group) > 1]
+    if besides := diagnosis.get("changes_besides"):
+        found += ["<h3>Used besides, no missing effect</h3>", bullet_list(besides)]
     if unsettled := diagnosis.get("unsettled"):
         found += ["<h3>Not settled in the time given</h3>", bullet_list(unsettled)]
     if effects:
@@ -79,6 +81,7 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
         ratio = (diagnosis.get("ratio") or [1.0])[-1]
         scatter = diagnosis.get("rests_on_scatter")
         much = f"residuals are {ratio:.2f} x noise" if scatter or ratio > QUIET_RATIO else NOISE_REACHED
+        much += ", with what is named below" if diagnosis.get("changes_besides") else ""
         return f"No discrepancy was detected: {much}{f'; {SCATTER_CLAUSE}' if scatter else ''}."
     if diagnosis["verdict"] == "unsettled":
         best = f" The best so far: {_gain_sentence(accepted)}" if accepted else ""

@@ -4,7 +4,7 @@ from html import unescape
 import pytest
 
 from concent_warp.comparison.compare import compare_replays
-from concent_warp.report.diagnosis_section import _bars, _headline, diagnosis_section
+from concent_warp.report.diagnosis_section import NOISE_REACHED, _bars, _headline, diagnosis_section
 from concent_warp.report.report import write_report
 
 
@@ -123,6 +123,14 @@ def test_without_an_effect_noise_is_what_is_left_only_where_no_more_is():
     for ratio, said in ((1.25, "down to their noise"), (1.36, "residuals are 1.36 x noise")):
         section = diagnosis_section({"verdict": "none_needed", "effects": [], "ratio": [9.0, ratio]})
         assert said in words_of(section)
+
+
+def test_what_the_model_has_besides_effects_is_named():
+    besides = "The model's limits of joints give way to a load."
+    said = words_of(diagnosis_section({"verdict": "none_needed", "ratio": [9.0, 1.0], "changes_besides": [besides]}))
+    assert f"{NOISE_REACHED}, with what is named below." in said
+    assert besides in said
+    assert "below" not in words_of(diagnosis_section({"verdict": "none_needed", "ratio": [1.0]}))
 
 
 def test_what_was_found_is_named_beside_what_no_effect_explains():

@@ -209,15 +209,15 @@ class Additions:
         return one.ratio * float(np.sqrt(left)) <= self.context.cfg.search.explained_ratio
 
     def with_holding(self, one: FittedModel) -> FittedModel:
-        """Return a fitted model with dry friction that holds where more than noise is left and that explains more."""
+        """Return a fitted model with constraints that hold where more than noise is left and that explains more."""
         context = self.context
         return self._held(one) if is_lacking(one, context.noise_factors, context.cfg) else one
 
     def _held(self, one: FittedModel) -> FittedModel:
-        """Return a fitted model with dry friction that holds where that explains more, else that model."""
+        """Return a fitted model with constraints that hold where that explains more, else that model."""
         context = self.context
-        context.progress("holding by friction")
-        unsettled = "Open: whether friction that holds explains more."
+        context.progress("constraints that hold")
+        unsettled = "Open: whether constraints that hold explain more."
         found = context.budget.attempt(lambda: hold(one, context.record.holding, context.cfg), None, unsettled)
         if found is None:
             return one
@@ -225,7 +225,7 @@ class Additions:
         return held
 
     def _held_instead(self, one: FittedModel) -> FittedModel | None:
-        """Return the model as given with dry friction that holds where it leaves no more than noise, else None.
+        """Return the model as given with constraints that hold where it leaves no more than noise, else None.
 
         It is None, too, where that explains no more. Such a model stays as given until an effect is found beside it;
         beside effects, and where more is left, friction has been tried before.
@@ -286,7 +286,7 @@ class Additions:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
 
         Errors of nominal values may hide those of the simulator's constants, and nominal values stand in for these:
-        where they leave more than noise, friction that holds is tried beside them, and then a shorter time step.
+        where they leave more than noise, constraints that hold are tried beside them, and then a shorter time step.
 
         Args:
             one: The fitted model.
@@ -311,9 +311,9 @@ class Additions:
     def within_tolerances(self, given: FittedModel) -> FittedModel | None:
         """Return the model as given with constants within their tolerance where that leaves next to nothing.
 
-        Nominal values, friction that holds, and a shorter time step where the model needs one. Where a model is far off
-        effects are looked for over short windows, without these, and would stand in for them. None where they leave
-        more.
+        Nominal values, constraints that hold, and a shorter time step where the model needs one. Where a model is far
+        off effects are looked for over short windows, without these, and would stand in for them. None where they
+        leave more.
 
         Args:
             given: The model as given, over windows as long as the motion allows.

@@ -1,9 +1,10 @@
-"""Dry friction that creeps, or depends on direction, by the simulator's default constants: no missing effect.
+"""Constraints that give way, or depend on direction, by the simulator's default constants: no missing effect.
 
-Where a model leaves these constants at their defaults, the same model with friction that holds, or with elliptic cones,
-is a rival of every effect; it has no parameters and therefore comes first where it explains more. A coefficient of
-friction that is wrong hides what the cones do: with a pyramid no coefficient fits, and with an ellipse the wrong one
-may fit worse. Cones are therefore compared beside a fitted coefficient, too.
+Where a model leaves these constants at their defaults, the same model with constraints that hold (friction, equality
+constraints, limits of joints), or with elliptic cones, is a rival of every effect; it has no parameters and therefore
+comes first where it explains more. A coefficient of friction that is wrong hides what the cones do: with a pyramid no
+coefficient fits, and with an ellipse the wrong one may fit worse. Cones are therefore compared beside a fitted
+coefficient, too.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.candidates import candidates
 from concent_warp.diagnosis.candidates.screening import robust_sum
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
-from concent_warp.diagnosis.result import HoldingFriction
+from concent_warp.diagnosis.constants import HoldingConstraint
 from concent_warp.diagnosis.search.time_step import explains_more, projected_residuals, refitted, renew_defects
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval
-from concent_warp.scene.holding import Holding, contact_constants, joint_constants, with_holding_friction
+from concent_warp.scene.holding import Holding, holding_constants, with_holding_constraints
 from concent_warp.scene.scene import Scene
 
 COEFFICIENT = "sliding_friction"
@@ -31,13 +32,13 @@ COEFFICIENT = "sliding_friction"
 
 
 def hold(
-    base: FittedModel, known: Sequence[HoldingFriction], cfg: DiagnoseCfg
-) -> tuple[FittedModel, tuple[HoldingFriction, ...]]:
-    """Return a fitted model with dry friction that holds wherever that explains significantly more, and where it does.
+    base: FittedModel, known: Sequence[HoldingConstraint], cfg: DiagnoseCfg
+) -> tuple[FittedModel, tuple[HoldingConstraint, ...]]:
+    """Return a fitted model with constraints that hold wherever that explains significantly more, and which do.
 
     Args:
         base: The fitted model.
-        known: Where friction holds already.
+        known: Constraints that hold already.
         cfg: Settings.
     """
     found, tried = tuple(known), {h.where for h in known}
@@ -59,8 +60,8 @@ def with_scene(last: FittedModel, scene: Scene, cfg: TimeStepCfg) -> FittedModel
 
 
 def _holding(base: FittedModel, where: Holding, cfg: DiagnoseCfg) -> FittedModel | None:
-    """Return a fitted model with friction that holds if that explains significantly more, else None."""
-    scene = with_holding_friction(base.model.scene, where)
+    """Return a fitted model with constraints that hold if that explains significantly more, else None."""
+    scene = with_holding_constraints(base.model.scene, where)
     if scene is None:
         return None
     other = replace(base, model=replace(base.model, scene=scene))
@@ -80,7 +81,7 @@ def _beside_coefficient(
     They are the model as it is and the one with other friction, both with a fitted coefficient, and the latter without;
     None where the other friction explains no more, or where no coefficient may be wrong.
     """
-    scene = with_holding_friction(base.model.scene, where)
+    scene = with_holding_constraints(base.model.scene, where)
     kinds = [] if scene is None else candidates(base.model, (), (COEFFICIENT,))
     if scene is None or not kinds:
         return None
@@ -99,10 +100,9 @@ def _with_effect(base: FittedModel, effect: Effect) -> FittedModel:
     return fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
 
 
-def _finding(base: FittedModel, better: FittedModel, where: Holding, seed: int) -> HoldingFriction:
-    """Return what friction that holds changes."""
+def _finding(base: FittedModel, better: FittedModel, where: Holding, seed: int) -> HoldingConstraint:
+    """Return what constraints that hold change."""
     gain = base.errors - errors_like(better, base)
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
-    scene = base.model.scene
-    settings = joint_constants(scene) if where == "joints" else contact_constants(scene, where)
-    return HoldingFriction(where, settings, float(gain.sum() / max(base.errors.sum(), 1e-12)), low, high)
+    settings = holding_constants(base.model.scene, where)
+    return HoldingConstraint(where, settings, float(gain.sum() / max(base.errors.sum(), 1e-12)), low, high)

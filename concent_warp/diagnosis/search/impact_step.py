@@ -14,7 +14,7 @@ import numpy as np
 from concent_warp.diagnosis.candidates.baseline import fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.result import FinerTimeStep
+from concent_warp.diagnosis.constants import FinerTimeStep
 from concent_warp.diagnosis.search.time_step import with_time_step, without_defects
 from concent_warp.fit.effects.impacts import impacts
 from concent_warp.fit.effects.robust import huber

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.result import Finding, FinerTimeStep, HoldingFriction
+from concent_warp.diagnosis.constants import FinerTimeStep, HoldingConstraint
+from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.reconsider import Rival
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
@@ -25,7 +26,7 @@ class Constants(NamedTuple):
     """Constants of the simulator that are other ones than as given; see `SearchRecord`."""
 
     time_step: FinerTimeStep | None
-    holding: tuple[HoldingFriction, ...]
+    holding: tuple[HoldingConstraint, ...]
     held_first: int
 
 
@@ -58,7 +59,7 @@ class SearchRecord:
     """The fitted models with all effects, where some are removed that are not established."""
     part_refused: bool = False
     """Whether the last search for an effect found some, and none that explains enough of the little that was left."""
-    holding: tuple[HoldingFriction, ...] = ()
+    holding: tuple[HoldingConstraint, ...] = ()
     """Where dry friction holds by other constants than the model has as given."""
     held_first: int = 0
     """How many of these hold in the model that effects are added to."""

@@ -166,9 +166,9 @@ class Revision:
             record.time_step = None if restored is not last else record.time_step
             last = restored
         if record.holding:
-            context.progress("restoring the constants of friction")
+            context.progress("restoring the constants of constraints")
             refit = partial(with_scene, last, given.model.scene, context.cfg.time_step)
-            restored = self._if_as_good(last, refit, sentence.format("friction that holds is needed"))
+            restored = self._if_as_good(last, refit, sentence.format("constraints that hold are needed"))
             record.holding = () if restored is not last else record.holding
             last = restored
         if nominal_effects(last.model):

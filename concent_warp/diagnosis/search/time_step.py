@@ -20,7 +20,7 @@ from concent_warp.diagnosis.candidates.baseline import errors_like, fitted_model
 from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.screening import robust_sum
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
-from concent_warp.diagnosis.result import FinerTimeStep
+from concent_warp.diagnosis.constants import FinerTimeStep
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.impacts import impacts

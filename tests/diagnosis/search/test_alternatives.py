@@ -17,8 +17,9 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
+from concent_warp.diagnosis.constants import FinerTimeStep
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.result import Diagnosis, Finding, FinerTimeStep
+from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search import alternatives as module
 from concent_warp.diagnosis.search import context
 from concent_warp.diagnosis.search.alternatives import _from, log_odds, plausibility, try_alternatives

@@ -15,7 +15,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
 from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
-from concent_warp.diagnosis.result import FinerTimeStep
+from concent_warp.diagnosis.constants import FinerTimeStep
 from concent_warp.diagnosis.search import time_step as module
 from concent_warp.diagnosis.search.time_step import (
     at_given_step,
