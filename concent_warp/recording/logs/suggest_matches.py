@@ -101,7 +101,7 @@ def match_order(
         left = [one for one in found.left(sensors) if kind_of(one) == kind and (one.position or one.velocity)]
         free = [one for one in found.free(signals) if not is_command(one) and said_or_position(one.name) == kind]
         free = [one for one in free if not one.name.endswith(("/x", "/y", "/z", "/w"))]
-        free = [one for one in free if not _in_vector(one.name, names)]
+        free = [one for one in free if not _in_vector(one.name, names) and not _is_part(one.name)]
         _by_order(found, left, free, _may_read, sensors)
 
 
@@ -112,6 +112,12 @@ def _in_vector(name: str, names: Collection[str]) -> bool:
         return False
     axes = "xyz" if hit[3].islower() else "XYZ"
     return all(f"{hit[1]}{hit[2]}{axis}{hit[4]}" in names for axis in axes)
+
+
+def _is_part(name: str) -> bool:
+    """Return whether a channel is named after a part of a vector or quaternion, such as fx, whatever else there is."""
+    last = parted_unit(name)[0][-1:]
+    return bool(last) and len(last[0]) > 1 and PART.fullmatch(last[0]) is not None
 
 
 def match_left(

@@ -225,6 +225,7 @@ def test_translations_are_not_taken_for_torques_nor_parts_of_a_wrench_for_joints
     sensors = POSITIONS + '<jointpos name="third" joint="hip"/>'
     assert text != (text := suggested(tmp_path, "fx,fy,fz", "", sensors))
     assert '"fx"' not in text
+    assert '"fx"' not in suggested(tmp_path, "fx,q_hip", "", POSITIONS.replace("knee_position", "other"))
 
 
 def test_channels_of_other_quantities_do_not_hinder_the_one_left_for_the_one_actuator(tmp_path):
