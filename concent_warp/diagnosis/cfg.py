@@ -102,6 +102,8 @@ class SearchCfg:
     """Share of the held-out error that a shorter time step, or nominal values within their tolerance, must remove while
     more than `DiagnoseCfg.form_error_ratio` is left [-]; where they remove less, an effect is looked for first, and
     they are tried again beside it. Empirical."""
+    stop_margin: Share = 0.1
+    """Largest distance of a joint from a limit, over its range, from which on effects at limits are candidates [-]."""
     alone_share: float = 1 / 3
     """Share of what the best of the others leaves beyond the noise, below which an effect counts that counts only where
     it explains the data alone (`Effect.is_alone`) [-]. Empirical."""
@@ -315,6 +317,12 @@ class NominalCfg:
     decisive_gain: Share = 0.5
     """Share of the held-out error that they must remove to be tried before effects where a model is far off [-]: errors
     of all of them together may be large beside the noise of good instruments."""
+    min_independent: Share = 0.05
+    """Share of the change by a value that the others must not be able to produce, for it to be fitted beside them [-]:
+    sensitivities are no more exact than that, and all of mass, stiffness, damping and force may scale together."""
+    left_out_share: Share = 0.02
+    """Share of the blocks, one at least, that are not counted where they become worst by values from other blocks [-]:
+    one event that something else is behind, such as an impact, has the largest residuals of all."""
     bounded_ratio: Positive = 1.1
     """Noise ratio up to which a fit with values at their bounds counts [-]; where more is left, something larger than a
     tolerance is missing. That of `SearchCfg.explained_ratio`."""

@@ -143,6 +143,8 @@ class Effect:
     """Whether it stands for a nominal value of the model within its tolerance, which no diagnosis calls missing."""
     singles_last: ClassVar[bool] = False
     """Whether a diagnosis considers `single_targets` only where no other candidate explains the data."""
+    at_limits: ClassVar[bool] = False
+    """Whether it acts at the limits of joints alone: on joints that come near one."""
     history: ClassVar[float] = 0.0
     """Length [s] of the history of commands on which the present command depends."""
 

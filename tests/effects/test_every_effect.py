@@ -56,7 +56,8 @@ CORD = """
   <body name="bob"><freejoint/><geom name="bob" size="0.04" mass="0.4"/><site name="eye" pos="0 0 0.03"/></body>
   <body name="sled" pos="1 0 0"><joint name="sled" type="slide" damping="0.5"/>
     <geom name="sled" size="0.04" mass="0.4"/>
-    <body name="load"><joint name="load" type="slide"/><geom name="load" size="0.03" mass="0.2"/></body></body>
+    <body name="load"><joint name="load" type="slide" range="-0.05 0.3"/>
+      <geom name="load" size="0.03" mass="0.2"/></body></body>
 </worldbody><tendon>
   <spatial name="cord" stiffness="60" damping="0.2" springlength="0.45"><site site="hook"/><site site="eye"/></spatial>
   <fixed name="band" stiffness="30"><joint joint="load" coef="1"/></fixed></tendon>

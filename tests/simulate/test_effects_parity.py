@@ -24,7 +24,8 @@ SCENE = """
   <geom name="floor" type="plane" size="5 5 0.1" friction="0.3 0.004" solref="0.01 1"/>
   <body name="upper" pos="0 0.5 0.5"><joint name="shoulder" axis="0 1 0" damping="0.01" armature="0.002"/>
     <geom type="capsule" fromto="0 0 0 0.02 0 -0.1" size="0.01" mass="0.4" contype="0" conaffinity="0"/>
-    <body name="lower" pos="0.02 0 -0.1"><joint name="elbow" axis="0 1 0" damping="0.005"/>
+    <body name="lower" pos="0.02 0 -0.1"><joint name="elbow" axis="0 1 0" damping="0.005"
+      range="-0.04 0.4"/>
       <geom type="capsule" fromto="0 0 0 0.01 0 -0.1" size="0.01" mass="0.2" contype="0" conaffinity="0"/></body></body>
   <body name="palm" pos="0 -0.5 0.2"><joint name="lift" type="slide" axis="0 0 1"/>
     <geom type="box" size="0.03 0.03 0.01" mass="0.3" contype="0" conaffinity="0"/>

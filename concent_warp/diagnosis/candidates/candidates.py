@@ -10,7 +10,9 @@ from concent_warp.effects.select import placing_joints
 from concent_warp.model import Model
 
 
-def candidates(model: Model, channels: Collection[str], names: Sequence[str] = ()) -> list[Effect]:
+def candidates(
+    model: Model, channels: Collection[str], names: Sequence[str] = (), stopped: Collection[str] | None = None
+) -> list[Effect]:
     """Return the effects that a model could lack, each on each selection that it may apply to.
 
     Effects of joints that only place a body (`placing_joints`) are left out unless they are asked for by name.
@@ -19,6 +21,7 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
         model: The model; what it has already is left out.
         channels: Sensors that were measured: instruments that recorded nothing lack nothing.
         names: Effects to take; all where empty.
+        stopped: Joints that come near a limit: no others show what happens there. All where it is None.
 
     Raises:
         ModelError: There is no such effect.
@@ -35,6 +38,10 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
                     continue
             if kind.kind == "joint" and not names:
                 target = tuple(t for t in target if t not in placing)
+                if not target:
+                    continue
+            if kind.at_limits and stopped is not None:
+                target = tuple(t for t in target if t in stopped)
                 if not target:
                     continue
             effect = kind(*target)

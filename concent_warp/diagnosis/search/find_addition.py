@@ -43,6 +43,7 @@ from concent_warp.diagnosis.search.nominal_values import (
 from concent_warp.diagnosis.search.reconsider import near_best
 from concent_warp.diagnosis.time_budget import in_words
 from concent_warp.effects.effect import Effect
+from concent_warp.effects.library.limits import is_stopped, reached_stops
 from concent_warp.fit.effects.observation import Window
 from concent_warp.model import Model
 from concent_warp.simulate.time_limit import TimeUpError
@@ -187,6 +188,18 @@ class AdditionFinder:
         needed = (1 - cfg.max_remainder) * max(1 - 1 / base.ratio**2, 0.0)
         return cfg.search.remainder_promise * needed
 
+    def _stopped(self, base: FittedModel) -> set[str]:
+        """Return the joints that come near a limit in the motion of a fitted model.
+
+        Where a stop lies elsewhere, the model moves on to its own.
+        """
+        m = base.model.scene.model
+        if not any(is_stopped(m, j) for j in range(m.njnt)):
+            return set()
+        solver = base.solver()
+        courses = solver.p.courses(solver.trials(base.fit.values, base.fit.offsets))
+        return reached_stops(m, [c.qpos for c in courses], self.context.cfg.search.stop_margin)
+
     def _candidates(self, base: FittedModel) -> tuple[list[Effect], list[Effect]]:
         """Return the effects that a fitted model may lack, and those considered only where none of these explains it.
 
@@ -194,7 +207,7 @@ class AdditionFinder:
         that was asked for by its name are among the former.
         """
         asked = self.context.cfg.effects
-        found = candidates(base.model, self.channels, asked)
+        found = candidates(base.model, self.channels, asked, self._stopped(base))
         later = [e for e in found if e.name not in asked and (e.is_part or is_single_of_many(e, found))]
         return [e for e in found if e not in later], later
 

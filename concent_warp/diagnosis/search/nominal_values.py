@@ -48,7 +48,13 @@ def with_nominal_values(
     sums, prior = block_sums(found.pieces, found.blocks, base.limit), base.cfg.least_squares.prior
     # Here the values themselves are judged: each fold is predicted from those of the others.
     errors = HeldOut(sums, found.blocks, prior).of_fit()
-    return found if errors.sum() <= (1 - min_gain) * base.errors.sum() else None
+    kept = _without_worst(errors - base.errors, cfg.left_out_share)
+    return found if errors[kept].sum() <= (1 - min_gain) * base.errors[kept].sum() else None
+
+
+def _without_worst(worse: np.ndarray, share: float) -> np.ndarray:
+    """Return the indices of blocks (B,) without a share of them, at least one, that become the worst."""
+    return np.argsort(worse, kind="stable")[: len(worse) - max(round(share * len(worse)), 1)]
 
 
 def _fitted(base: FittedModel, nominal: Sequence[Effect]) -> FittedModel:
@@ -121,7 +127,12 @@ class NominalSensitivities:
 
     def of(self, kinds: Sequence[Effect]) -> np.ndarray:
         """Return the sensitivities to some nominal values alone, shape (n, k)."""
-        return self.named([(effect.name, target) for effect in kinds for target in effect.target])
+        return self.named(self.names_of(kinds))
+
+    def names_of(self, kinds: Sequence[Effect]) -> list[tuple[str, str]]:
+        """Return the names and targets of some nominal values, in the order of their columns."""
+        wanted = {(effect.name, target) for effect in kinds for target in effect.target}
+        return [name for name in self.names if name in wanted]
 
     def named(self, names: Iterable[tuple[str, str]]) -> np.ndarray:
         """Return the sensitivities to nominal values of these names and targets alone, shape (n, k)."""
@@ -147,8 +158,9 @@ def nominal_errors(
     residuals to these and K to that one (consider covariance: Tapley, Schutz and Born, "Statistical Orbit
     Determination", 2004, chapter 6). Errors d have their tolerance as a prior, and change the residuals, the parameters
     adapted, by no more than what the model leaves beyond the noise, or than what counts as noise still
-    (`DiagnoseCfg.min_gain`): larger ones would show. Those that were fitted are known no better than that, as what is
-    left may be the error of a formula. Left out are those that an effect of the model stands for (`Effect.is_within`).
+    (`DiagnoseCfg.min_gain`): larger ones would show. For effects those that were fitted are known no better than that,
+    as what is left may be the error of a formula; they themselves are as uncertain as those that stayed as given, for
+    which they may stand, make them. Left out are those that an effect of the model stands for (`Effect.is_within`).
 
     Args:
         last: The fitted model.
@@ -157,17 +169,25 @@ def nominal_errors(
             that explains the data; by default they are simulated.
     """
     spread = np.zeros(len(last.fit.values))
-    parts = zip(last.model.effects, last.prediction().split, strict=True)
-    own = [k for added, part in parts if not added.effect.nominal for k in range(part.start, part.stop)]
     kinds = possible_nominal_effects(last.model)
-    if not own or not kinds or not cfg.nominal.enabled:
+    if not len(spread) or not kinds or not cfg.nominal.enabled:
         return spread
+    parts = list(zip(last.model.effects, last.prediction().split, strict=True))
+    nominal = np.concatenate([np.full(part.stop - part.start, added.effect.nominal) for added, part in parts])
     weights = [np.sqrt(huber_weight(piece.residual, last.limit))[:, None] for piece in last.pieces]
-    j = np.concatenate([piece.jacobian[:, own] * w for piece, w in zip(last.pieces, weights, strict=True)])
-    k = (sensitivities or nominal_sensitivities(last)).of(kinds) * np.concatenate(weights)
-    k = np.nan_to_num(k, posinf=0.0, neginf=0.0)
+    j = np.concatenate([piece.jacobian * w for piece, w in zip(last.pieces, weights, strict=True)])
+    known = sensitivities or nominal_sensitivities(last)
+    k = np.nan_to_num(known.of(kinds) * np.concatenate(weights), posinf=0.0, neginf=0.0)
     excess = max(last.ratio**2 - 1, cfg.min_gain) / last.noise_scale**2
-    spread[own] = considered_std(j, k, excess, last.cfg.least_squares.prior)
+    prior = last.cfg.least_squares.prior
+    if not nominal.all():
+        spread[~nominal] = considered_std(j[:, ~nominal], k, excess, prior)
+    fitted = {
+        (added.effect.name, target) for added, _ in parts if added.effect.nominal for target in added.effect.target
+    }
+    others = [name not in fitted for name in known.names_of(kinds)]
+    if nominal.any() and any(others):
+        spread[nominal] = considered_std(j, k[:, others], excess, prior)[nominal]
     return spread
 
 
@@ -243,14 +263,15 @@ def _most_visible(columns: np.ndarray, cfg: NominalCfg) -> list[int]:
 def _independent(columns: np.ndarray, cfg: NominalCfg) -> list[int]:
     """Return which columns (n, K) change the residuals by more than `min_change` beyond those chosen before them.
 
-    Gram-Schmidt with pivoting (Golub and Van Loan, "Matrix Computations", 2013, section 5.4).
+    What is left of a column must also be more than its own errors. Gram-Schmidt with pivoting (Golub and Van Loan,
+    "Matrix Computations", 2013, section 5.4).
     """
     left, chosen = np.nan_to_num(columns, posinf=0.0, neginf=0.0), []
-    least = cfg.min_change * np.sqrt(len(columns))
+    least = np.maximum(cfg.min_change * np.sqrt(len(columns)), cfg.min_independent * np.linalg.norm(left, axis=0))
     while len(chosen) < cfg.max_values:
         sizes = np.linalg.norm(left, axis=0)
-        k = int(np.argmax(sizes))
-        if sizes[k] < least:
+        k = int(np.argmax(np.where(sizes >= least, sizes, 0.0)))
+        if sizes[k] < least[k]:
             break
         chosen.append(k)
         direction = left[:, k] / sizes[k]

@@ -12,6 +12,7 @@ from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.contact_forces import AdhesionForce, AnisotropicForce, TurningForce
 from concent_warp.effects.library.drives import GRIP_FACTORS
 from concent_warp.effects.library.joints import FRICTION_SCATTER, MUJOCO
+from concent_warp.effects.library.solref import as_time_and_ratio, compliance_parameters, scaled
 from concent_warp.effects.select import (
     element_name,
     fingers,
@@ -202,13 +203,6 @@ class AnisotropicFriction(SurfaceEffect):
         return AnisotropicForce(m, self.ids(m))
 
 
-REBOUND_FACTORS = (0.6, 0.35, 0.2, 0.1)
-"""Damping ratios over the model's that are tried with its stiffness: from a ball of clay to one that bounces well, the
-share of the velocity that is left, exp(-pi r / sqrt(1 - r^2)), is never far from that of one of them [-]."""
-DAMPED_FACTORS = (1.7, 3.0, 6.0)
-"""The same above the model's."""
-
-
 class ContactCompliance(SurfaceEffect):
     """Contacts softer, harder or bouncier than the model's."""
 
@@ -232,19 +226,7 @@ class ContactCompliance(SurfaceEffect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Time constant and damping ratio; the null values are the means of body and surroundings."""
         time, ratio = map(float, self.mean(m))
-        least, most = min(2 * m.opt.timestep, time), max(0.2, 5 * time)
-        low, high = min(0.02, 0.2 * ratio), max(5.0, 5 * ratio)
-        # The damping ratio alone changes the stiffness, too, by its square: the model's time step does not resolve one
-        # that bounces and has the time constant of one that does not. Along these lines the stiffness is the model's.
-        lines = tuple(
-            tuple((x, y) for f in line if least <= (x := time / f) <= most and low <= (y := ratio * f) <= high)
-            for line in (REBOUND_FACTORS, DAMPED_FACTORS)
-        )
-        scan = (0.1 * ratio, 0.3 * ratio, 0.6 * ratio)
-        return (
-            Parameter("time_constant", "s", time, float(least), most, 0.5 * time, scan_together=lines),
-            Parameter("damping_ratio", "-", ratio, low, high, 0.4, scan=scan),
-        )
+        return compliance_parameters(time, ratio, float(m.opt.timestep))
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Reference of the contact's spring."""
@@ -252,10 +234,8 @@ class ContactCompliance(SurfaceEffect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the mean, and all others in proportion."""
-        geoms, factor = self.geoms(m), values / self.mean(m)
-        direct = geoms[m.geom_solref[geoms, 0] <= 0]
-        m.geom_solref[np.setdiff1d(geoms, direct)] *= factor
-        m.geom_solref[direct] *= [1 / np.prod(factor) ** 2, 1 / factor[0]]
+        geoms = self.geoms(m)
+        m.geom_solref[geoms] = scaled(m.geom_solref[geoms], values / self.mean(m))
 
 
 def _mean_solref(m: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
@@ -272,10 +252,7 @@ def _mean_solref(m: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
     means = [m.geom_solref[ids].mean(axis=0) for ids in sides if len(ids)]
     if not direct.any():
         return np.mean(means, axis=0)
-    stiffness, damping = -np.min(means, axis=0)
-    if not (stiffness > 0 and damping > 0):
-        return np.array([np.inf, 0.0])
-    return np.array([2 / damping, damping / (2 * np.sqrt(stiffness))])
+    return as_time_and_ratio(np.min(means, axis=0))
 
 
 class Adhesion(SurfaceEffect):

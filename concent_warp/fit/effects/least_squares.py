@@ -55,6 +55,10 @@ class LeastSquaresCfg:
     """Least step of a finite difference, in units of the parameter's typical scale [-]."""
     max_step: Positive = 0.3
     """Largest step of a finite difference, in units of the parameter's typical scale [-]."""
+    nominal_steps: Positive = 20.0
+    """First and largest steps of nominal values over those of other parameters [-]: their scale is a tenth of their
+    tolerance, within which residuals are in proportion to them. With smaller steps, what was measured at a joint's stop
+    was when it comes there between two time steps."""
     target_change: Positive = 3.0
     """Mean change of the residuals that a finite difference aims at, in units of noise [-]: with contacts, residuals
     jump a little from value to value, and smaller steps measure the jumps."""
@@ -168,7 +172,9 @@ class Solver:
         self.scale = np.array([q.scale for q in prediction.parameters])
         self.low = np.array([q.low for q in prediction.parameters])
         self.high = np.array([q.high for q in prediction.parameters])
-        self.step = np.full(len(self.scale), self.cfg.first_step)
+        self.wider = np.where(prediction.nominal, self.cfg.nominal_steps, 1.0)
+        """Steps of finite differences that are usual for each parameter, over those for parameters of effects [-]."""
+        self.step = self.cfg.first_step * self.wider
         self.search = InitialStateSearch(prediction, self.cfg.initial_states, self.cfg.robust)
 
     def fit_initial_states(
@@ -501,7 +507,7 @@ class Solver:
         """Choose the next steps of finite differences, so that residuals change by about `target_change`."""
         change = np.sqrt(np.mean(np.concatenate(jacobian) ** 2, axis=0)) * self.scale
         steps = np.where(change > 0, self.cfg.target_change / np.maximum(change, 1e-12), 1.0)
-        self.step = np.clip(steps, self.cfg.min_step, self.cfg.max_step)
+        self.step = np.clip(steps, self.cfg.min_step, self.cfg.max_step * self.wider)
 
     def fit(
         self,

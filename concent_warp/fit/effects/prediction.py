@@ -134,8 +134,9 @@ class Prediction:
         self._edits = [i for i, e in enumerate(self.effects) if e.edits]
         free = self._base.scene.model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
         self._moves_freely = bool(free.any())
-        self.measured_only = np.zeros(len(self.parameters), dtype=bool)
+        self.measured_only, self.nominal = np.zeros((2, len(self.parameters)), dtype=bool)
         for e, part in zip(self.effects, self.split, strict=True):
+            self.nominal[part] = e.nominal
             moves = e.edits or e.commands or type(e).write is not Effect.write
             pure = e.measures and not moves and type(e).force_model is Effect.force_model
             self.measured_only[part] = pure and not (self._moves_freely and e.misleads_start)

@@ -78,6 +78,7 @@ class SyntheticPrediction:
             for name, null, smallest, largest, scale in zip("abc", start, low, high, scales, strict=False)
         )
         self.measured_only = np.array([False, False, True])[: len(start)]
+        self.nominal = np.zeros(len(start), dtype=bool)
         self.impact, self.simulated = impact, 0.0
         self.requests: list[SimulationRequest] = []
         self.windows: Any = []
