@@ -43,6 +43,7 @@ OURS: tuple[type[Effect], ...] = (
     drives.GravityCompensation,
     tendons.TendonStiffness,
     tendons.TendonDamping,
+    tendons.TendonFriction,
     objects.Mass,
     objects.CenterOfMass,
     objects.Inertia,

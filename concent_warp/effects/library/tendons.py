@@ -1,4 +1,4 @@
-"""Effects in tendons: springs, cables and belts along them."""
+"""Effects in tendons: springs, cables and belts along them, and what rubs in their sheaths."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.library.joints import MUJOCO, USUAL_SHARE
-from concent_warp.effects.select import element_name
+from concent_warp.effects.library.joints import FRICTION_SCATTER, MUJOCO, USUAL_SHARE
+from concent_warp.effects.select import element_name, typical_torque
+from concent_warp.scene.holding import FRICTION_IMPEDANCE, TIME_CONSTANT_STEPS
 
 SCANNED = (0.5, 0.7, 1.4, 2.0)
 """Stiffnesses that are tried, over the model's [-]: what swings on a spring soon is in another phase."""
@@ -17,6 +18,8 @@ USUAL_LENGTH = 0.05
 """Typical difference of a rest length from the model's, relative to it [-]."""
 LEAST_LENGTH = 0.01
 """Least such difference [m or rad]."""
+LEAST_ARM = 1e-6
+"""Least arm of a tendon about a joint that it moves [m or -]."""
 
 
 class TendonEffect(Effect):
@@ -112,6 +115,66 @@ class TendonDamping(TendonEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the damping."""
         m.tendon_damping[self.ids(m)] = np.maximum(values, 0.0)
+
+
+class TendonFriction(TendonEffect):
+    """Dry friction along tendons, as of a cable in its sheath."""
+
+    name = "tendon_friction"
+    summary = "A force of constant size along the tendon against its motion, which holds it at rest: |F| <= force."
+    source = f"Coulomb friction; MuJoCo's frictionloss of tendons ({MUJOCO})"
+    signature = "residual force along the tendon like -sign(speed of its length); what it moves sticks together"
+    confusions = ("joint_friction", "tendon_damping", "load_friction", "actuator_gain")
+    requirement = "tendons that move joints"
+    variables = ("joint velocity",)
+    formula_error = FRICTION_SCATTER
+
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether it moves joints."""
+        return len(_typical_forces(m, i)) > 0
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all tendons with a name."""
+        named = [element_name(m, mujoco.mjtObj.mjOBJ_TENDON, t) for t in range(m.ntendon)]
+        names = tuple(n for t, n in enumerate(named) if n and len(_typical_forces(m, t)))
+        return (names,) if names else ()
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let it hold stiffly, where the tendon has no friction of its own yet."""
+        for n in self.target:
+            tendon = spec.tendon(n)
+            if not tendon.frictionloss:
+                tendon.solref_friction = [TIME_CONSTANT_STEPS * spec.option.timestep, 1.0]
+                tendon.solimp_friction[:2] = FRICTION_IMPEDANCE
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Return one force for each tendon; typically what moves the lightest of its joints at 3 rad/s^2."""
+        found = []
+        for n, t, (_, unit) in zip(self.target, self.ids(m), self.units(m), strict=True):
+            null, usual = float(m.tendon_frictionloss[t]), float(_typical_forces(m, int(t)).min())
+            scale = max(USUAL_SHARE * null, USUAL_SHARE * usual)
+            unit = "N m" if unit.startswith("N m") else "N"
+            found.append(Parameter(f"force[{n}]", unit, null, 0.0, max(5 * null, 60 * usual), scale))
+        return tuple(found)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Friction loss."""
+        return ("tendon_frictionloss",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the friction loss."""
+        m.tendon_frictionloss[self.ids(m)] = np.maximum(values, 0.0)
+
+
+def _typical_forces(m: mujoco.MjModel, tendon: int) -> np.ndarray:
+    """Return the force along a tendon that moves each of its joints at 10 rad/s^2 or m/s^2 [N or N m], shape (n,)."""
+    d = mujoco.MjData(m)
+    mujoco.mj_fwdPosition(m, d)
+    row = slice(m.ten_J_rowadr[tendon], m.ten_J_rowadr[tendon] + m.ten_J_rownnz[tendon])
+    arms, dofs = np.abs(d.ten_J[row]), m.ten_J_colind[row]
+    joints = m.dof_jntid[dofs[arms > LEAST_ARM]]
+    return typical_torque(m, joints) / arms[arms > LEAST_ARM]
 
 
 def _turns(m: mujoco.MjModel, tendon: int) -> bool:
