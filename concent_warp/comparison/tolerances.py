@@ -53,8 +53,8 @@ class ToleranceRange:
     @property
     def text(self) -> str:
         """The range in words, such as ``1.2 to 8.0 x``."""
-        low, high = f"{self.low:.1f}", ratio_text(self.high)
-        return f"{low} to {high}" if np.isfinite(self.low) else high
+        low, high = ratio_text(self.low), ratio_text(self.high)
+        return high if low == high else f"{low.removesuffix(' x')} to {high}"
 
 
 def tolerance_ranges(

@@ -282,6 +282,9 @@ class TimeStepCfg:
     error_factor: Factor = 1.5
     """By how much that error may be larger than a first-order one [-]: motion that amplifies small differences does.
     Empirical."""
+    max_error_known: Positive = 30.0
+    """Error over the noise that a shorter step may still have, above which it may be of any size [-]: first order holds
+    no more. Empirical."""
     max_lengthening: Annotated[int, Bounds(1, 1000)] = 8
     """Most of the model's steps that simulations take at once while effects are looked for; 1 for none."""
     max_error_of_longer: Positive = 0.5

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.effects.library.tendons import TendonDamping, TendonStiffness
+from concent_warp.effects.library.tendons import TendonDamping, TendonFriction, TendonStiffness
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
@@ -82,6 +82,29 @@ def test_units_of_tendons_are_those_of_the_joints_that_they_add_up():
     assert found == ["N m/rad", "rad"]
     (damping,) = TendonDamping("spring").parameters(Scene(turning).model)
     assert (damping.unit, damping.null) == ("N m s/rad", 0.3)
+
+
+def test_friction_along_a_tendon_holds_what_hangs_on_it_and_slows_it_by_its_size():
+    xml = SLED.replace("<worldbody>", "<option timestep='0.001' gravity='3 0 0'/><worldbody>")
+    xml = xml.replace(' stiffness="150" damping="0.3"', "").replace('type="slide"', 'type="slide" axis="1 0 0"')
+    model = Model(Scene(xml.replace('size="0.1"', 'size="0.1" contype="0" conaffinity="0"')))
+    assert TendonFriction.targets(model.compile()) == (("rope", "spring"),)
+    weight = 3.0 * float(model.compile().body("sled").mass[0])
+    for share in (1.2, 0.4):
+        m = model.add(TendonFriction("rope"), [share * weight]).compile()
+        d = mujoco.MjData(m)
+        mujoco.mj_step(m, d, 200)
+        assert d.joint("sled").qvel[0] == pytest.approx(max(1 - share, 0.0) * 3.0 * 0.2, abs=3e-3)
+        assert d.joint("stage").qvel[0] == pytest.approx(3.0 * 0.2, abs=1e-6)
+
+
+def test_friction_along_a_tendon_has_the_units_of_what_the_tendon_adds_up():
+    (force,) = TendonFriction("rope").parameters(Scene(SLED).model)
+    assert (force.name, force.unit, force.null) == ("force[rope]", "N", 0.0)
+    (torque,) = TendonFriction("rope").parameters(Scene(SLED.replace('type="slide"', "")).model)
+    assert torque.unit == "N m"
+    still = SLED.replace('<joint joint="sled" coef="1"/></fixed>', '<joint joint="sled" coef="0"/></fixed>')
+    assert TendonFriction.targets(Scene(still).model) == (("spring",),)
 
 
 def test_tendons_without_a_spring_have_none_of_another_stiffness():

@@ -191,6 +191,9 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
 def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> bool:
     """Return whether what a model leaves may be the error that the shorter time step still has.
 
+    It may be where it is no more than that error, and where that error is so large that it may be of any size: it falls
+    in proportion to the step only where it is small, not for a body that spins fast.
+
     Args:
         last: The fitted model.
         step: The time step that it uses.
@@ -198,7 +201,7 @@ def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> boo
     """
     if step.impacts or step.error <= cfg.max_error_left:  # scatter of impacts counts as noise already
         return False
-    return bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
+    return step.error > cfg.max_error_known or bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
 
 
 def without_defects(one: FittedModel) -> FittedModel:

@@ -19,6 +19,7 @@ from concent_warp.diagnosis.search import nominal_values
 from concent_warp.diagnosis.search.nominal_values import (
     _independent,
     _visible,
+    _without_worst,
     considered_std,
     nominal_errors,
     nominal_sensitivities,
@@ -30,6 +31,7 @@ from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums, cut_blocks
 from concent_warp.fit.effects.least_squares import Solver
 from concent_warp.fit.effects.nominal import possible_nominal_effects
+from concent_warp.fit.effects.observe import observe
 from tests.scenes.foreign import PUSHER, pusher
 from tests.scenes.swinging import drawing, swung, windows_of
 
@@ -41,6 +43,16 @@ def test_columns_that_others_can_produce_are_left_out():
     assert list(_independent(columns, NominalCfg())) == [1, 2]
     assert list(_independent(columns, NominalCfg(max_values=1))) == [1]
     assert not _independent(columns, NominalCfg(min_change=2.0))
+    # What no other can produce of the first column is above `min_change`, but no more than an error of its derivative.
+    large = np.stack([50 * a, 50 * a + 1.0 * b], axis=1)
+    assert len(_independent(large, NominalCfg())) == 1
+    assert len(_independent(large, NominalCfg(min_independent=0.01))) == 2
+
+
+def test_the_blocks_that_become_worst_are_not_counted():
+    worse = np.array([0.0, 5.0, -1.0, 2.0, 0.0])
+    assert sorted(_without_worst(worse, 0.02)) == [0, 2, 3, 4]
+    assert sorted(_without_worst(worse, 0.4)) == [0, 2, 4]
 
 
 def test_a_nominal_value_that_acts_like_a_parameter_gives_it_its_own_error():
@@ -102,6 +114,24 @@ def test_candidates_share_the_sensitivities_to_nominal_values_of_the_model_that_
     exact = nominal_errors(added, cfg)
     assert exact.min() > 0
     assert nominal_errors(added, cfg, shared) == pytest.approx(exact, rel=0.2)
+
+
+def test_a_nominal_value_is_known_no_better_than_those_that_it_may_stand_for():
+    """Inertia, damping and drive of a pusher scale together."""
+    recording = pusher(damping=0.05, delay=0.0, seconds=3.0)
+    model = cw.Model.from_recording(recording)
+    windows = observe(model, recording)
+    base, cfg = fit_baseline(model, windows, cut_blocks(windows), "mujoco"), cw.DiagnoseCfg(jobs=1)
+    (gains,) = (e for e in possible_nominal_effects(model) if e.name == "nominal_gain")
+    one = nominal_values._fitted(base, [gains])
+    spread = nominal_errors(one, cfg)
+    assert spread.shape == (2,)
+    # In units of the scale, a tenth of the tolerance; all but their own spread is that of what stays as given.
+    assert spread.max() > 3.0
+    no_others = replace(
+        nominal_sensitivities(one), names=(), columns=np.zeros((sum(len(p.residual) for p in one.pieces), 0))
+    )
+    assert nominal_errors(one, cfg, no_others).max() == 0.0
 
 
 def test_the_tolerance_of_a_drive_widens_the_interval_of_a_damping_unless_nominal_values_are_exact():

@@ -252,7 +252,15 @@ def test_states_far_off_are_fitted_by_simulations_with_the_shorter_step():
 
 
 @pytest.mark.parametrize(
-    ("change", "ratio", "expected"), [(102.0, 13.8, True), (102.0, 23.0, False), (6.0, 1.3, False), (8.0, 1.9, True)]
+    ("change", "ratio", "expected"),
+    [
+        (102.0, 13.8, True),
+        (102.0, 23.0, False),
+        (6.0, 1.3, False),
+        (8.0, 1.9, True),
+        (203.0, 90.0, False),
+        (217.0, 90.0, True),
+    ],
 )
 def test_what_may_be_the_error_of_the_shorter_step_is_no_sign_that_something_is_missing(change, ratio, expected):
     last: Any = SimpleNamespace(noise_ratio=ratio)
