@@ -42,12 +42,7 @@ from concent_warp.diagnosis.search.form_error import error_of_own_friction, said
 from concent_warp.diagnosis.search.impact_errors import said_of_impacts, stand, with_errors_of_impacts
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
-from concent_warp.diagnosis.search.time_step import (
-    corrected,
-    longer_time_step,
-    may_be_step,
-    renew_defects,
-)
+from concent_warp.diagnosis.search.time_step import corrected, longer_time_step, may_be_step, renew_defects
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -412,7 +407,8 @@ class Procedure:
         explained = verdict == "none_needed" or not cfg.explain
         verdict = budget.verdict(verdict, [f.step for f in record.findings if f.accepted])
         step = record.time_step
-        if verdict == "none_of_these" and not adequate and step is not None and may_be_step(last, step, cfg.time_step):
+        in_time, doubtful = verdict != "unsettled", not adequate and verdict in ("none_of_these", "unsettled")
+        if step is not None and doubtful and may_be_step(last, step, cfg.time_step, of_any_size=not in_time):
             verdict, step = "unsettled", replace(step, too_long=True)
         named = verdict in ("effect", "group")
         where = budget.attempt(

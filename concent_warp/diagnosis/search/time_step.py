@@ -188,7 +188,7 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
     )
 
 
-def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> bool:
+def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg, *, of_any_size: bool = False) -> bool:
     """Return whether what a model leaves may be the error that the shorter time step still has.
 
     It may be where it is no more than that error, and where that error is so large that it may be of any size: it falls
@@ -198,10 +198,13 @@ def may_be_step(last: FittedModel, step: FinerTimeStep, cfg: TimeStepCfg) -> boo
         last: The fitted model.
         step: The time step that it uses.
         cfg: Settings.
+        of_any_size: Whether only an error counts that may be of any size.
     """
     if step.impacts or step.error <= cfg.max_error_left:  # scatter of impacts counts as noise already
         return False
-    return step.error > cfg.max_error_known or bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
+    if step.error > cfg.max_error_known:
+        return True
+    return not of_any_size and bool(last.noise_ratio <= np.hypot(1.0, cfg.error_factor * step.error))
 
 
 def without_defects(one: FittedModel) -> FittedModel:

@@ -267,6 +267,7 @@ def test_what_may_be_the_error_of_the_shorter_step_is_no_sign_that_something_is_
     step = FinerTimeStep(2e-3, 2.5e-4, change, 0.98, 0.97, 0.99)
     assert step.error == pytest.approx(change / 7)
     assert may_be_step(last, step, TimeStepCfg()) == expected
+    assert may_be_step(last, step, TimeStepCfg(), of_any_size=True) == (change == 217.0)
     assert "shorten the step" not in step.sentence
     too_long = replace(step, too_long=True)
     assert "shorten the step of the model further" in too_long.sentence
