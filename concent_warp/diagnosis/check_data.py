@@ -73,9 +73,16 @@ def _outside_range(m: mujoco.MjModel, name: str, values: np.ndarray, cfg: CheckD
         return ""
     unit = kind_and_unit(m, sensor)[1]
     farthest = float(values.max() if values.max() - high > low - values.min() else values.min())
-    return (
+    said = (
         f"readings up to {farthest:.3g} {unit} are outside the range of {m.joint(joint).name}, {low:.3g} to {high:.3g}"
         f" {unit}, where the simulated joint stops. Correct the range, or the unit or zero of the readings."
+    )
+    wide = np.rad2deg([low - margin, high + margin])
+    if unit != "rad" or values.min() < wide[0] or values.max() > wide[1]:
+        return said
+    return (
+        f"{said} They fit {np.rad2deg(low):.3g} to {np.rad2deg(high):.3g} rad: an MJCF states angles in degrees, "
+        'unless it has <compiler angle="radian"/>.'
     )
 
 

@@ -339,9 +339,8 @@ class Diagnosis:
                     "tolerance, or of the fit, may be as large: the fall of the error speaks for it."
                 )
         if self.verdict == "none_of_these":
-            said.append(
-                f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
-            )
+            share = f"{100 * self.unexplained:.0f} %" if self.unexplained >= 0.005 else "Less than 1 %"
+            said.append(f"{share} of the discrepancy stays unexplained by any effect in the library.")
             if not self.explains and self.accepted:
                 too_little = "The effects above explain too little to be added: the model stays as given."
                 said.append(FARTHER if self.farther else too_little)

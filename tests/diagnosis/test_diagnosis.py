@@ -158,6 +158,8 @@ def test_what_no_effect_explains_is_reported_with_its_share():
     assert said[0].startswith("Explains a part: joint_friction")
     assert any(s.startswith("40 % of the discrepancy stays unexplained") for s in said)
     assert said[-1] == "Next experiment: swing faster: a and b then differ by 4.0 x noise (angle)."
+    little = diagnosis(verdict="none_of_these", unexplained=0.004).sentences()
+    assert any(s.startswith("Less than 1 % of the discrepancy stays unexplained") for s in little)
 
 
 def test_what_is_left_and_taken_for_errors_in_formulas_is_named_with_its_size():

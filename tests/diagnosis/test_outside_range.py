@@ -48,3 +48,16 @@ def test_a_single_outlier_is_no_motion_outside_the_range():
     positions = swing(0.5)
     positions[50] = 2.0
     assert said_of(positions) == []
+
+
+def test_a_range_in_radians_that_the_model_took_for_degrees_is_named():
+    hinge = SCENE.replace('name="rail" type="slide"', 'name="rail"')
+    assert "radian" not in " ".join(said_of(swing(0.83)))
+    for limits, hinted in (('range="-2 2"', True), ('range="-0.7 0.7"', False)):
+        time = np.linspace(0.0, 2.0, 201)
+        measured = {"rail_pos": Channel(time, swing(1.5)[:, None], 1e-4)}
+        (said,) = check_data(Recording(hinge.format(range=limits), (Demonstration("demo_0", measured=measured),)))
+        assert "readings up to 1.5 rad are outside" in said
+        assert (
+            'They fit -2 to 2 rad: an MJCF states angles in degrees, unless it has <compiler angle="radian"/>.' in said
+        ) == hinted
