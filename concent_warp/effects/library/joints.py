@@ -99,10 +99,14 @@ class DryFriction(JointEffect):
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Let it hold stiffly, where the joint has no friction of its own yet."""
         for n in self.target:
-            joint = spec.joint(n)
-            if not joint.frictionloss:
-                joint.solref_friction = [TIME_CONSTANT_STEPS * spec.option.timestep, 1.0]
-                joint.solimp_friction[:2] = FRICTION_IMPEDANCE
+            let_friction_hold(spec.joint(n), spec.option.timestep)
+
+
+def let_friction_hold(element: mujoco.MjsJoint | mujoco.MjsTendon, timestep: float) -> None:
+    """Let the friction of a joint or tendon hold stiffly at a time step [s], where it has none of its own yet."""
+    if not element.frictionloss:
+        element.solref_friction = [TIME_CONSTANT_STEPS * timestep, 1.0]
+        element.solimp_friction[:2] = FRICTION_IMPEDANCE
 
 
 class JointFriction(DryFriction, BearingEffect):

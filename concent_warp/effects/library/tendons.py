@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.library.joints import FRICTION_SCATTER, MUJOCO, USUAL_SHARE
+from concent_warp.effects.library.joints import FRICTION_SCATTER, MUJOCO, USUAL_SHARE, let_friction_hold
 from concent_warp.effects.select import element_name, typical_torque
-from concent_warp.scene.holding import FRICTION_IMPEDANCE, TIME_CONSTANT_STEPS
 
 SCANNED = (0.5, 0.7, 1.4, 2.0)
 """Stiffnesses that are tried, over the model's [-]: what swings on a spring soon is in another phase."""
@@ -23,22 +22,27 @@ LEAST_ARM = 1e-6
 
 
 class TendonEffect(Effect):
-    """An effect in tendons along which a model has a spring or a damper."""
+    """An effect in tendons, by default in those along which a model has a spring or a damper."""
 
     family = "joints"
     kind = "tendon"
     needed: ClassVar[tuple[str, ...]]
     """Fields of the compiled model of which one is above 0 for the tendons on which it acts."""
 
+    @classmethod
+    def suits(cls, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether it may act on a tendon."""
+        return any(float(getattr(m, name)[i]) > 0 for name in cls.needed)
+
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether the model has such a spring or damper along a tendon."""
-        return any(float(getattr(m, name)[i]) > 0 for name in self.needed)
+        """Return whether it may act on a tendon."""
+        return self.suits(m, i)
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return all such tendons with a name."""
-        found = np.flatnonzero(np.any([getattr(m, name) > 0 for name in cls.needed], axis=0))
-        names = tuple(n for t in found if (n := element_name(m, mujoco.mjtObj.mjOBJ_TENDON, int(t))))
+        found = (t for t in range(m.ntendon) if cls.suits(m, t))
+        names = tuple(n for t in found if (n := element_name(m, mujoco.mjtObj.mjOBJ_TENDON, t)))
         return (names,) if names else ()
 
     def units(self, m: mujoco.MjModel) -> list[tuple[str, str]]:
@@ -129,24 +133,15 @@ class TendonFriction(TendonEffect):
     variables = ("joint velocity",)
     formula_error = FRICTION_SCATTER
 
-    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether it moves joints."""
-        return len(_typical_forces(m, i)) > 0
-
     @classmethod
-    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return all tendons with a name."""
-        named = [element_name(m, mujoco.mjtObj.mjOBJ_TENDON, t) for t in range(m.ntendon)]
-        names = tuple(n for t, n in enumerate(named) if n and len(_typical_forces(m, t)))
-        return (names,) if names else ()
+    def suits(cls, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the tendon moves joints."""
+        return len(_typical_forces(m, i)) > 0
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Let it hold stiffly, where the tendon has no friction of its own yet."""
         for n in self.target:
-            tendon = spec.tendon(n)
-            if not tendon.frictionloss:
-                tendon.solref_friction = [TIME_CONSTANT_STEPS * spec.option.timestep, 1.0]
-                tendon.solimp_friction[:2] = FRICTION_IMPEDANCE
+            let_friction_hold(spec.tendon(n), spec.option.timestep)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return one force for each tendon; typically what moves the lightest of its joints at 3 rad/s^2."""
