@@ -55,7 +55,7 @@ class LeastSquaresCfg:
     """Least step of a finite difference, in units of the parameter's typical scale [-]."""
     max_step: Positive = 0.3
     """Largest step of a finite difference, in units of the parameter's typical scale [-]."""
-    nominal_steps: Positive = 20.0
+    nominal_steps: Positive = 10.0
     """First and largest steps of nominal values over those of other parameters [-]: their scale is a tenth of their
     tolerance, within which residuals are in proportion to them. With smaller steps, what was measured at a joint's stop
     was when it comes there between two time steps."""
