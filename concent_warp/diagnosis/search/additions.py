@@ -302,7 +302,8 @@ class Additions:
         held = self.with_holding(found)
         if stays_within(held, context.cfg.nominal, enough):
             return held
-        finer = self._finer(held) if with_step else None
+        # Constraints that hold, beside which nominal values are right, may need a shorter step than those as given.
+        finer = self._finer(held) if with_step or held is not found else None
         if finer is not None and stays_within(finer, context.cfg.nominal, enough):
             return self._adopt([held], finer)[-1]
         context.record.holding = holding

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.nominal_values import NominalSensitivities
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.nominal import BOUND
+from concent_warp.fit.effects.bounded_step import step_within
 from concent_warp.fit.effects.cross_validation import Sums, block_sums
 from concent_warp.fit.effects.least_squares import Linear
 from concent_warp.fit.effects.nominal import possible_nominal_effects
@@ -153,9 +153,7 @@ def _held_out(sums: Sums, fold: np.ndarray, prior: float, low: np.ndarray, high:
     for f in np.unique(fold):
         out = fold == f
         normal = sums.normal[~out].sum(axis=0) + np.eye(len(low)) / prior**2
-        root = np.linalg.cholesky(normal)
-        target = -np.linalg.solve(root, sums.slope[~out].sum(axis=0))
-        step = lsq_linear(root.T, target, (low, high), method="bvls").x
+        step = step_within(normal, sums.slope[~out].sum(axis=0), low, high)
         curved = np.einsum("bij,i,j->b", sums.normal[out], step, step)
         errors[out] += 2 * sums.slope[out] @ step + curved
     return errors

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from concent_warp.checks import Count, Factor, Positive, Share
+from concent_warp.fit.effects.bounded_step import step_within
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch, start_cost, start_step
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
@@ -607,6 +608,15 @@ class Solver:
         """Return values within their bounds; infinite ones stay."""
         return np.where(np.isinf(values), values, np.clip(values, self.low, self.high))
 
+    def _step_inside(self, normal: np.ndarray, slope: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the step within the bounds, shape (P,) in units of the scales; infinite values stay."""
+        move = np.zeros(len(values))
+        low, high = np.minimum(self.low - values, 0.0) / self.scale, np.maximum(self.high - values, 0.0) / self.scale
+        free = ~np.isinf(values) & (low < high)
+        if free.any():
+            move[free] = step_within(normal[np.ix_(free, free)], slope[free], low[free], high[free])
+        return move
+
     def prior(self, values: np.ndarray) -> np.ndarray:
         """Return the parameters' distances from the mean of their prior, in units of its standard deviation."""
         mean = self.p.prior_mean
@@ -669,16 +679,8 @@ class Solver:
             normal += jw @ window.jacobian - c.T @ solved[:, :size]
             slope += jw @ window.residual - c.T @ solved[:, size]
             parts.append(solved)
-        curvature = np.maximum(np.diag(normal), 1e-9)
-        move = -np.linalg.solve(normal + damping * np.diag(curvature), slope)
-        # Parameters at a bound whose step leads outside stay fixed while the others move.
-        at_bound = ((values <= self.low) & (move < 0)) | ((values >= self.high) & (move > 0)) | np.isinf(values)
-        if at_bound.any():
-            free = ~at_bound
-            move = np.zeros(size)
-            if free.any():
-                sub = normal[np.ix_(free, free)] + damping * np.diag(curvature[free])
-                move[free] = -np.linalg.solve(sub, slope[free])
+        damped = normal + damping * np.diag(np.maximum(np.diag(normal), 1e-9))
+        move = self._step_inside(damped, slope, values)
         return move, [-(s[:, size] + s[:, :size] @ move) for s in parts]
 
 

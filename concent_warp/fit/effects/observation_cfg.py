@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Count, Positive, PositiveDuration, Share
+from concent_warp.checks import Bounds, Count, Factor, Positive, PositiveDuration, Share
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,12 @@ class ObservationCfg:
     """Deviation of the mean of such a pair from the simulation without an error, over the noise and the numerical
     scatter, at which a window ends [-]: beyond it, the effect of an error is no longer in proportion to it.
     Empirical."""
+    max_growth: Factor = 6.0
+    """Growth of the effect of an error of the initial state over the second half of a window at which it ends where
+    nothing that moves freely can be touched [-]: an unstable machine, as one that a controller balances, amplifies the
+    model's errors as it does those, and a window's best initial state is then far from the true one. Empirical."""
+    least_growth: Positive = 30.0
+    """Effect of such an error, over the noise, below which a window goes on all the same [-]. Empirical."""
     max_transient: Annotated[float, Bounds(0)] = 0.1
     """Longest time of such deviations that a window goes on after, once [s]: of the rebound of a body on joints without
     drives, which one start has earlier than its opposite, and after which the effect is in proportion again. The body

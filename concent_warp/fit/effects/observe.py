@@ -192,7 +192,7 @@ def keeps_close(
     simulator = make_engine(engine, source.model.with_payloads(d.payloads))
     variants = Variants(len(offsets), qpos=positions, qvel=velocities)
     rollout = simulator.run(variants, commands(m, d, steps, start), record=record, bodies=[]).numpy()
-    curved = np.zeros(len(record))
+    curved, grown = np.zeros((2, len(record)))
     for name, std in noise.items():
         row = m.sensor(name).id
         address, dim = m.sensor_adr[row], m.sensor_dim[row]
@@ -204,10 +204,29 @@ def keeps_close(
             scatter = np.sqrt((_rms(away[near:]) ** 2).mean(axis=0)) if rough else np.zeros(len(record))
         scatter = np.clip(np.nan_to_num(scatter), 0.0, cfg.max_scatter_noise)
         curved = np.maximum(curved, np.nan_to_num(bend / np.hypot(1.0, scatter), nan=np.inf))
+        with np.errstate(invalid="ignore", over="ignore"):
+            grown = np.maximum(grown, np.nan_to_num(np.sqrt((_rms(away[1:near]) ** 2).mean(axis=0)), nan=np.inf))
     passing = round(cfg.max_transient / (every * m.opt.timestep)) if _may_rebound(m) and not rough else 0
     end = _end_of_proportion(curved > cfg.max_curvature, passing)
+    if not rough and (unstable := _end_of_stability(grown, cfg)) is not None:
+        end = unstable if end is None else min(end, unstable)
     reach = span if end is None else float(record[end] * m.opt.timestep)
     return float(np.clip(reach, cfg.min_length, span))
+
+
+def _end_of_stability(grown: np.ndarray, cfg: ObservationCfg) -> int | None:
+    """Return where differences of the initial state have grown exponentially by too much, None where they never have.
+
+    Those of a body that moves on without a force double over the second half of any time, those of one in a constant
+    field quadruple; those of an unstable machine grow by a factor that itself grows.
+
+    Args:
+        grown: Differences over the noise, shape (T,), at equal distances in time from 0 on.
+        cfg: Settings.
+    """
+    half = grown[(np.arange(len(grown)) + 1) // 2]
+    too_large = (grown > cfg.max_growth * np.maximum(half, 1.0)) & (grown > cfg.least_growth)
+    return int(np.argmax(too_large)) if too_large.any() else None
 
 
 def _end_of_proportion(wild: np.ndarray, most: int) -> int | None:

@@ -1,6 +1,7 @@
 """Steps of the least squares against dense references, and the rules by which a step is taken, on written-down data."""
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -66,14 +67,30 @@ def test_a_step_is_that_of_the_dense_normal_equations(damping):
     np.testing.assert_allclose(np.concatenate([move, *moves]), expected, rtol=1e-9)
 
 
+def least_within(whole: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the step of least cost whose first parts are within bounds: each of them free, or at one of its two."""
+    best, least, size = np.zeros(len(slope)), 0.0, len(low)
+    for choice in product((0, 1, 2), repeat=size):
+        free = np.append(np.array(choice) == 0, np.ones(len(slope) - size, dtype=bool))
+        step = np.zeros(len(slope))
+        step[:size] = np.where(np.array(choice) == 1, low, np.where(np.array(choice) == 2, high, 0.0))
+        step[free] = -np.linalg.solve(whole[np.ix_(free, free)], slope[free] + whole[np.ix_(free, ~free)] @ step[~free])
+        inside = (step[:size] >= low - 1e-12).all() and (step[:size] <= high + 1e-12).all()
+        cost = slope @ step + 0.5 * step @ whole @ step
+        if inside and cost < least:
+            best, least = step, cost
+    return best
+
+
 @pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("where", ["low", "high", "beyond", "infinite"])
-def test_a_parameter_whose_step_leads_out_of_its_bounds_stays_and_the_others_take_the_best_step(seed, where):
+@pytest.mark.parametrize("where", ["low", "high", "near", "beyond", "infinite"])
+def test_a_step_is_the_best_one_within_the_bounds(seed, where):
     solver, given = solver_of(), problem(seed)
     inner = np.array([0.7, 2.0, -0.3])
     edges = {
         "low": solver.low,
         "high": solver.high,
+        "near": solver.high - 0.01 * solver.scale,
         "beyond": np.array([solver.low[0] - 0.1, solver.high[1] + 0.1, solver.high[2] + 0.1]),
         "infinite": np.array([np.inf, solver.high[1], 0.1]),
     }[where]
@@ -82,12 +99,13 @@ def test_a_parameter_whose_step_leads_out_of_its_bounds_stays_and_the_others_tak
         move, moves = solver.solve(**given, values=values, damping=0.1)
         finite = np.where(np.isfinite(values), values, solver.p.start)
         whole, slope = dense(solver, given, finite, 0.1)
-        first = -np.linalg.solve(whole, slope)[:3]
-        fixed = ((values <= solver.low) & (first < 0)) | ((values >= solver.high) & (first > 0)) | np.isinf(values)
-        free = np.append(~fixed, np.ones(6, dtype=bool))
-        expected = np.zeros(9)
-        expected[free] = -np.linalg.solve(whole[np.ix_(free, free)], slope[free])
-        np.testing.assert_allclose(np.concatenate([move, *moves]), expected, rtol=1e-8, atol=1e-12)
+        low, high = (
+            np.minimum(solver.low - values, 0) / solver.scale,
+            np.maximum(solver.high - values, 0) / solver.scale,
+        )
+        low, high = (np.where(np.isinf(values), 0.0, bound) for bound in (low, high))
+        expected = least_within(whole, slope, low, high)
+        np.testing.assert_allclose(np.concatenate([move, *moves]), expected, rtol=1e-7, atol=1e-9)
 
 
 def test_where_all_parameters_stay_the_initial_states_alone_move():
