@@ -117,6 +117,17 @@ def restart_candidate(
     return _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
 
 
+def restart_like(base: FittedModel, candidate: FittedCandidate, leader: FittedCandidate) -> FittedCandidate:
+    """Return the better of a fit and its refit from the value of an effect that moves the same, as far as is known.
+
+    Both have one parameter of the same unit, as a delay of commands and one of readings. Initial states begin at the
+    measured ones, as those of the other effect may have another meaning: late readings show an earlier state.
+    """
+    solver = candidate_solver(base, candidate.effect)
+    fit = solver.polish(solver.fit(leader.fit.values))
+    return _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
+
+
 def multiple_shooting_candidate(
     base: FittedModel, candidate: FittedCandidate, short_windows: Sequence[Window]
 ) -> FittedCandidate:

@@ -17,6 +17,7 @@ from concent_warp.diagnosis.candidates.fit_candidate import (
     multiple_shooting_candidate,
     polish_candidate,
     restart_candidate,
+    restart_like,
     search_candidate_value,
 )
 from concent_warp.diagnosis.candidates.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
@@ -88,6 +89,7 @@ class CandidateFits:
         self._fit_confusions(screened)
         if self._restart_left_behind():
             self.refit_rivals(np.array([c.share(self.base) for c in self.fits]))
+        self._restart_like_best()
         if self._best().ratio > self.cfg.adequate_ratio and self._left() > self.cfg.unknown_force.min_share:
             self._initialise_by_multiple_shooting(short_windows)
         return self.fits
@@ -251,7 +253,8 @@ class CandidateFits:
         of which a screening saw nothing, must not be missing from the group.
         """
         best, search = self._best(), self.search
-        if best.ratio >= search.explained_ratio or best.share(self.base) < self.cfg.min_gain:
+        little = best.ratio < search.explained_ratio or self._explains_nearly_all(best)
+        if not little or best.share(self.base) < self.cfg.min_gain:
             return
         known = {id(s) for s in (*self.fitted, *self.left)}
         rivals = [s for s in screened if id(s) not in known and _are_confused(s.effect, best.effect)]
@@ -263,6 +266,34 @@ class CandidateFits:
             else:
                 self.fitted.append(s)
                 self.fits.append(c)
+
+    def _explains_nearly_all(self, one: FittedCandidate) -> bool:
+        """Return whether a candidate leaves no more than a further effect may leave of a small remainder."""
+        return one.share(self.base) >= 1 - self.cfg.max_remainder
+
+    def _restart_like_best(self) -> None:
+        """Refit what a best one is confused with, and what explains far less, from the best one's value.
+
+        From no change on, steps may lead nowhere where errors grow as fast as they do in an unstable machine.
+        """
+        best = self._best()
+        if not self._explains_nearly_all(best):
+            return
+        least, units = self.search.close_min_gain * best.share(self.base), self._added_units(best.effect)
+        behind = [
+            k
+            for k, c in enumerate(self.fits)
+            if c.share(self.base) <= least
+            and _are_confused(c.effect, best.effect)
+            and self._added_units(c.effect) == units
+        ]
+        if len(units) == 1:
+            self._refit(behind, restart_like, "fitting confusions", best)
+
+    def _added_units(self, effect: Effect) -> list[str]:
+        """Return the units of an effect's parameters."""
+        prediction = self.base.prediction(effect)
+        return [p.unit for p in prediction.parameters[prediction.owned :]]
 
     def _restart_left_behind(self) -> bool:
         """Restart candidates far behind a best one that leaves only noise from its initial states.

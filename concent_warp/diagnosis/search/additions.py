@@ -60,6 +60,9 @@ class Additions:
             # What a shorter time step leaves has a structure, too: that of the errors of both steps.
             explained = step or record.time_step is not None
             if explained and not is_lacking(fitted[-1], factors, cfg):
+                if step and not effects_alone and is_lacking(fitted[-1], {}, cfg):
+                    # More is left than the noise as estimated: nominal values may explain it, which are no effect.
+                    fitted = self._with_nominal(fitted, None, first) or fitted
                 break
             if step and context.is_form_error(fitted[-1], first):
                 if record.provisional is None:

@@ -48,6 +48,9 @@ class ObservationCfg:
     model's errors as it does those, and a window's best initial state is then far from the true one. Empirical."""
     least_growth: Positive = 30.0
     """Effect of such an error, over the noise, below which a window goes on all the same [-]. Empirical."""
+    balanced_factor: Factor = 1.5
+    """Length of other windows of a motion over that of one that ended so, up to which they may be longer [-].
+    Empirical."""
     max_transient: Annotated[float, Bounds(0)] = 0.1
     """Longest time of such deviations that a window goes on after, once [s]: of the rebound of a body on joints without
     drives, which one start has earlier than its opposite, and after which the effect is in proportion again. The body

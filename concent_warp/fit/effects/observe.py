@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -117,13 +117,16 @@ def observe(
         channels = [c for c in source.noise if c in d.measured]
         last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
         start = 0.0 if d.qpos is not None or d.action else first_time(d, channels)
-        measured = source.measured(d) or (source.guided(d) if rough else None)
+        measured, balanced = source.measured(d) or (source.guided(d) if rough else None), np.inf
         while start < last - 1e-6:
             end = last
             if measured is not None:
                 reach = length
                 if reach is None:
-                    reach = keeps_close(source, d, start, min(last, start + longest), engine, seed)
+                    found = proportional_span(source, d, start, min(last, start + longest), engine, seed)
+                    # A replay that has fallen from the balance grows no more, and tells no more of that.
+                    balanced = min(balanced, cfg.balanced_factor * found.length) if found.unstable else balanced
+                    reach = min(found.length, balanced)
                 end = np.inf if last - start - reach < cfg.min_length else _calmest(measured, start, reach, cfg)
                 end = end if last - end >= cfg.min_length else last
             if (window := source.window(number, start, end)) is not None:
@@ -167,7 +170,23 @@ def has_touchable_free_body(m: mujoco.MjModel) -> bool:
 def keeps_close(
     source: ObservedRecording, d: Demonstration, start: float, last: float, engine: EngineName, seed: int
 ) -> float:
-    """Return for how long [s] the effects of errors of an initial state stay in proportion to them."""
+    """Return the length of `proportional_span` [s]."""
+    return proportional_span(source, d, start, last, engine, seed).length
+
+
+class ProportionalSpan(NamedTuple):
+    """For how long the effects of errors of an initial state stay in proportion to them, and small."""
+
+    length: float
+    """Duration [s]."""
+    unstable: bool
+    """Whether they have grown by too much at its end, as those of an unstable machine."""
+
+
+def proportional_span(
+    source: ObservedRecording, d: Demonstration, start: float, last: float, engine: EngineName, seed: int
+) -> ProportionalSpan:
+    """Return for how long the effects of errors of an initial state stay in proportion to them, and small."""
     cfg, m = source.cfg, source.model.compile()
     span = min(last - start, cfg.max_length)
     steps = max(int(np.ceil(span / m.opt.timestep)), 1)
@@ -208,10 +227,11 @@ def keeps_close(
             grown = np.maximum(grown, np.nan_to_num(np.sqrt((_rms(away[1:near]) ** 2).mean(axis=0)), nan=np.inf))
     passing = round(cfg.max_transient / (every * m.opt.timestep)) if _may_rebound(m) and not rough else 0
     end = _end_of_proportion(curved > cfg.max_curvature, passing)
-    if not rough and (unstable := _end_of_stability(grown, cfg)) is not None:
-        end = unstable if end is None else min(end, unstable)
+    grown_end = None if rough else _end_of_stability(grown, cfg)
+    unstable = grown_end is not None and (end is None or grown_end <= end)
+    end = grown_end if unstable else end
     reach = span if end is None else float(record[end] * m.opt.timestep)
-    return float(np.clip(reach, cfg.min_length, span))
+    return ProportionalSpan(float(np.clip(reach, cfg.min_length, span)), unstable)
 
 
 def _end_of_stability(grown: np.ndarray, cfg: ObservationCfg) -> int | None:

@@ -46,6 +46,27 @@ def test_noise_that_may_be_larger_than_its_estimate_ends_the_search(monkeypatch)
         assert is_lacking(node(1.03 * factor), made.context.noise_factors, made.context.cfg)
 
 
+def test_what_the_noise_may_be_at_most_is_left_to_nominal_values_first(monkeypatch):
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "stays_within", lambda *_: True)
+    better, asked = node(1.0, nominal=1, effects=1), []
+
+    def nominal(one, *_):
+        asked.append(one)
+        return better if one.ratio < 3.0 else None
+
+    monkeypatch.setattr(context, "with_nominal_values", nominal)
+    for ratio, found in ((1.4, better), (1.01, None)):  # of a noise that is half as large again, at most
+        made, nodes = procedure(), [node(3.0), node(ratio, effects=1)]
+        made.context.noise_factors = {"angle": 1.5}
+        monkeypatch.setattr(made.additions.finder, "find", lambda _base, step, nodes=nodes, **_: (nodes[step + 1], ()))
+        monkeypatch.setattr(made.additions, "with_holding", lambda one: one)
+        asked.clear()
+        assert made.additions.add_effects(nodes[:1], ())[0] == [nodes[0], found or nodes[1]]
+        assert (nodes[1] in asked) == (found is not None)
+
+
 @pytest.mark.parametrize(
     ("corrected", "explains_more", "added", "form"),
     [

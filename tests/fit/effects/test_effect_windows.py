@@ -13,7 +13,7 @@ from concent_warp.estimation.partial_state import PartialState
 from concent_warp.fit.effects import observe as observing
 from concent_warp.fit.effects.observation import ObservedRecording, first_time, start_spread
 from concent_warp.fit.effects.observation_cfg import ObservationCfg
-from concent_warp.fit.effects.observe import _calmest, channel_noises, observe
+from concent_warp.fit.effects.observe import ProportionalSpan, _calmest, channel_noises, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -189,12 +189,12 @@ def cuts(monkeypatch) -> dict[str, Any]:
     """Windows without a simulation: motion keeps close for 0.5 s, and all ends are calm."""
     told: dict[str, Any] = {"reach": 0.5, "measured": SimpleNamespace(), "calls": []}
 
-    def keeps(source: Any, d: Any, start: float, last: float, engine: str, seed: int) -> float:
+    def keeps(source: Any, d: Any, start: float, last: float, engine: str, seed: int) -> ProportionalSpan:
         del source, d
         told["calls"].append((start, last, engine, seed))
-        return told["reach"]
+        return ProportionalSpan(told["reach"], unstable=False)
 
-    monkeypatch.setattr(observing, "keeps_close", keeps)
+    monkeypatch.setattr(observing, "proportional_span", keeps)
     monkeypatch.setattr(observing, "_calmest", lambda _, start, reach, __: start + reach)
     monkeypatch.setattr(ObservedRecording, "measured", lambda *_: told["measured"])
     monkeypatch.setattr(
@@ -206,6 +206,13 @@ def cuts(monkeypatch) -> dict[str, Any]:
 def spans(recording: Recording, **options: Any) -> list[tuple[int, float, float]]:
     found = observe(drawing(recording), recording, noise={"angle": 1e-3}, **options)
     return [(w.number, round(w.start, 6), round(w.end, 6)) for w in found]
+
+
+@pytest.mark.usefixtures("cuts")
+def test_windows_of_an_unstable_machine_are_little_longer_than_one_that_its_growth_ends(monkeypatch):
+    told = iter([(0.3, False), (0.2, True), (0.9, False), (0.25, False), (0.9, False)])
+    monkeypatch.setattr(observing, "proportional_span", lambda *_: ProportionalSpan(*next(told)))
+    assert spans(swung(seconds=1.3)) == [(0, 0.0, 0.3), (0, 0.3, 0.5), (0, 0.5, 0.8), (0, 0.8, 1.05), (0, 1.05, 1.3)]
 
 
 def test_windows_follow_one_another_to_the_last_sample(cuts):
