@@ -556,6 +556,13 @@ class Solver:
             if gain < self.cfg.tolerance:
                 converged = True
                 break
+        if np.any(self.p.nominal):
+            # Values that scale together leave a flat direction, along which damped steps hardly move to the prior.
+            state = _State(values, list(offsets), cost, starts, 0, limit)
+            found = self._advance(state, linear, 0.0)[0]
+            if found.cost < cost:
+                values, offsets, cost, starts = found.values, found.offsets, found.cost, found.starts
+                linear = self.linearise(values, offsets)
         cost = self.cost([window.residual for window in linear], offsets, values)
         return Fit(values, tuple(offsets), cost, linear, starts, converged, self.p.simulated)
 
