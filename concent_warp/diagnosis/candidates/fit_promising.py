@@ -277,9 +277,9 @@ class CandidateFits:
         From no change on, steps may lead nowhere where errors grow as fast as they do in an unstable machine.
         """
         best = self._best()
-        if not self._explains_nearly_all(best):
+        if not self._explains_nearly_all(best) or len(units := self._added_units(best.effect)) != 1:
             return
-        least, units = self.search.close_min_gain * best.share(self.base), self._added_units(best.effect)
+        least = self.search.close_min_gain * best.share(self.base)
         behind = [
             k
             for k, c in enumerate(self.fits)
@@ -287,8 +287,7 @@ class CandidateFits:
             and _are_confused(c.effect, best.effect)
             and self._added_units(c.effect) == units
         ]
-        if len(units) == 1:
-            self._refit(behind, restart_like, "fitting confusions", best)
+        self._refit(behind, restart_like, "fitting confusions", best)
 
     def _added_units(self, effect: Effect) -> list[str]:
         """Return the units of an effect's parameters."""

@@ -557,14 +557,23 @@ class Solver:
                 converged = True
                 break
         if np.any(self.p.nominal):
-            # Values that scale together leave a flat direction, along which damped steps hardly move to the prior.
-            state = _State(values, list(offsets), cost, starts, 0, limit)
-            found = self._advance(state, linear, 0.0)[0]
-            if found.cost < cost:
-                values, offsets, cost, starts = found.values, found.offsets, found.cost, found.starts
+            state = self._undamped(_State(values, list(offsets), cost, starts, refits, limit), linear)
+            if state.cost < cost:
+                values, offsets = state.values, state.offsets
                 linear = self.linearise(values, offsets)
         cost = self.cost([window.residual for window in linear], offsets, values)
         return Fit(values, tuple(offsets), cost, linear, starts, converged, self.p.simulated)
+
+    def _undamped(self, state: _State, linear: Sequence[Linear]) -> _State:
+        """Return the point after one step without damping, or the same one where that does not lower the cost.
+
+        Nominal values that scale together leave a flat direction, along which damped steps hardly move to the prior.
+        """
+        move, moves = self.solve(linear, state.starts, state.offsets, state.values, 0.0, state.limit)
+        values = self.inside(state.values + move * self.scale)
+        offsets = [o + m for o, m in zip(state.offsets, moves, strict=True)]
+        cost = self.cost(self.p.residuals(self.trials(values, offsets)), offsets, values, state.limit)
+        return replace(state, values=values, offsets=offsets, cost=cost) if cost < state.cost else state
 
     def _limit(self, linear: Sequence[Linear]) -> float:
         """Return the limit of Huber's loss that goes with the spread of some residuals."""

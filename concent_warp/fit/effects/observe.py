@@ -117,16 +117,17 @@ def observe(
         channels = [c for c in source.noise if c in d.measured]
         last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
         start = 0.0 if d.qpos is not None or d.action else first_time(d, channels)
-        measured, balanced = source.measured(d) or (source.guided(d) if rough else None), np.inf
+        measured = source.measured(d) or (source.guided(d) if rough else None)
+        most = np.inf
         while start < last - 1e-6:
             end = last
             if measured is not None:
                 reach = length
                 if reach is None:
                     found = proportional_span(source, d, start, min(last, start + longest), engine, seed)
-                    # A replay that has fallen from the balance grows no more, and tells no more of that.
-                    balanced = min(balanced, cfg.balanced_factor * found.length) if found.unstable else balanced
-                    reach = min(found.length, balanced)
+                    # Once a replay has fallen from the balance, errors grow no more, and do not end the window.
+                    most = min(most, cfg.balanced_factor * found.length) if found.unstable else most
+                    reach = min(found.length, most)
                 end = np.inf if last - start - reach < cfg.min_length else _calmest(measured, start, reach, cfg)
                 end = end if last - end >= cfg.min_length else last
             if (window := source.window(number, start, end)) is not None:

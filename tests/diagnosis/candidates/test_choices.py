@@ -248,6 +248,27 @@ def test_fits_near_the_best_that_have_not_reached_the_noise_are_polished(monkeyp
     assert [d[1] for d in tasks.done] == ["b", "c"]  # those above 0.85 of 0.8 are left to the rivals
 
 
+@pytest.mark.parametrize(
+    ("gain", "units", "other_units", "refitted"),
+    [
+        (0.86, ["s"], ["s"], ["confused"]),
+        (0.84, ["s"], ["s"], []),  # it leaves more than a further effect may leave
+        (0.86, ["s"], ["rad"], []),  # its value says nothing of the other
+        (0.86, ["s", "-"], ["s", "-"], []),
+    ],
+)
+def test_confusions_of_a_best_that_explains_nearly_all_begin_at_its_value(
+    monkeypatch, gain, units, other_units, refitted
+):
+    best, confused = made("best", gain, ratio=3.0), made("confused", 0.1, confusions=("best",))
+    fits = [best, confused, made("other", 0.1), made("close", 0.8, confusions=("best",))]
+    search, done = fits_of(fits), []
+    monkeypatch.setattr(search, "_added_units", lambda effect: units if effect == best.effect else other_units)
+    monkeypatch.setattr(fit_promising, "restart_like", lambda _base, c, leader: done.append((c.name, leader)) or c)
+    search._restart_like_best()
+    assert done == [(name, best) for name in refitted]
+
+
 def test_fits_that_explain_far_less_than_they_promised_are_polished_too(monkeypatch):
     assert (SearchCfg().stuck_share, SearchCfg().polished_stuck) == (0.5, 3)
     best = made("best", 0.8)

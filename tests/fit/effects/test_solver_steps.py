@@ -105,7 +105,23 @@ def test_a_step_is_the_best_one_within_the_bounds(seed, where):
         )
         low, high = (np.where(np.isinf(values), 0.0, bound) for bound in (low, high))
         expected = least_within(whole, slope, low, high)
-        np.testing.assert_allclose(np.concatenate([move, *moves]), expected, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(np.concatenate([move, *moves]), expected, rtol=1e-8, atol=1e-12)
+
+
+def test_a_fit_of_nominal_values_ends_with_a_step_without_damping(monkeypatch):
+    solvers, given = [solver_of(cfg=LeastSquaresCfg(iterations=1, damping=1e3)) for _ in range(2)], []
+    solvers[1].p.nominal[0] = True
+    undamped = Solver.solve
+
+    def solve(self, *args, **options):
+        given.append(args[4])
+        return undamped(self, *args, **options)
+
+    monkeypatch.setattr(Solver, "solve", solve)
+    plain, nominal = (solver.fit(np.array([0.1, 1.4, 0.0])) for solver in solvers)
+    assert nominal.cost < plain.cost
+    assert given.count(0.0) == 1
+    assert given[-1] == 0.0
 
 
 def test_where_all_parameters_stay_the_initial_states_alone_move():

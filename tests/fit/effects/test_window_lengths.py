@@ -88,6 +88,38 @@ def test_a_window_ends_where_what_opposite_errors_do_differs_by_some_noise(monke
     assert reach(Simulated(both), monkeypatch, turned=1e-5, angle=1e-3) == pytest.approx(0.12)
 
 
+@pytest.mark.parametrize(
+    ("rate", "noise", "rebounds", "end"),
+    [
+        (8.0, 1e-5, False, 0.46),  # exp(4 t) > 6 from t = 0.448 on; records are 0.01 s apart
+        (4.0, 1e-5, False, 0.9),
+        (8.0, 1e-3, False, 0.46),  # 40 x noise by then
+        (8.0, 2e-3, False, 0.52),  # 32 x noise
+        (2.0, 1e-5, False, 1.4),  # not within the time
+        (8.0, 1e-5, True, 1.4),  # bodies that move freely have rules of their own
+    ],
+)
+def test_a_window_ends_where_errors_have_grown_exponentially(monkeypatch, rate, noise, rebounds, end):
+    def sensordata(record: np.ndarray) -> np.ndarray:
+        data = np.zeros((19, len(record), 5))
+        sign = np.resize([1.0, -1.0], 12)[:, None]
+        data[1:13, :, 0] = sign * 1e-3 * np.exp(rate * record * 0.005)
+        data[:, :, 1] = 1.0
+        return data
+
+    assert reach(Simulated(sensordata), monkeypatch, angle=noise, rebounds=rebounds) == pytest.approx(end)
+
+
+def test_errors_that_grow_as_those_of_a_body_in_a_constant_field_end_no_window(monkeypatch):
+    def sensordata(record: np.ndarray) -> np.ndarray:
+        data = np.zeros((19, len(record), 5))
+        data[1:13, :, 0] = np.resize([1.0, -1.0], 12)[:, None] * (record * 0.005) ** 2
+        data[:, :, 1] = 1.0
+        return data
+
+    assert reach(Simulated(sensordata), monkeypatch, angle=1e-6) == pytest.approx(1.4)
+
+
 def test_scatter_of_rebounds_from_nearly_the_same_state_counts_as_noise_up_to_a_limit(monkeypatch):
     # 0.004 * 4 t^2 > 3 * 1e-3 hypot(1, 2) from t = 0.648 on, and with the limit of 5 from 0.978 on.
     for scatter, end in ((0.0, 0.44), (2e-3, 0.65), (1.0, 0.98)):
